@@ -938,6 +938,14 @@ def _surface(g: Generator, batch: int, height: int, width: int) -> dict[str, Ten
     return {"position": position, "normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth, "label": label}
 
 
+def _move_far_out(motion: Tensor) -> None:
+    motion[..., 0], motion[..., 1] = 1e4 + 0.5, -1e4 - 0.5
+
+
+def _forget_some(motion: Tensor) -> None:
+    motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
+
+
 def _history_cases(accumulating: bool) -> tuple[Case, ...]:
     def case(
         name: str,
@@ -981,10 +989,10 @@ def _history_cases(accumulating: bool) -> tuple[Case, ...]:
     everything = ("position", "normal", "depth")
 
     def far_out(drawn: _History) -> None:
-        drawn.motion[..., 0], drawn.motion[..., 1] = 1e4 + 0.5, -1e4 - 0.5
+        _move_far_out(drawn.motion)
 
     def unknown(drawn: _History) -> None:
-        drawn.motion[:, 0, :, 0], drawn.motion[:, 1, :, 1], drawn.motion[..., 2] = torch.inf, torch.nan, -torch.inf
+        _forget_some(drawn.motion)
 
     def still(drawn: _History) -> None:
         drawn.motion.zero_()
@@ -1045,12 +1053,6 @@ def _resampling_cases() -> tuple[Case, ...]:
 
         return Case(name, kind, tensors, smooth)
 
-    def far_out(motion: Tensor) -> None:
-        motion[..., 0], motion[..., 1] = 1e4 + 0.5, -1e4 - 0.5
-
-    def unknown(motion: Tensor) -> None:
-        motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
-
     return (
         case("5x7", "ordinary", (1, 1, 5, 7)),
         case("batch of 2, RGB", "ordinary", (2, 3, 4, 5)),
@@ -1060,8 +1062,8 @@ def _resampling_cases() -> tuple[Case, ...]:
         # Zero is a whole pixel, where the derivative in the motion jumps.
         case("still", "ordinary", (1, 3, 2, 3), lambda motion: motion.zero_(), smooth=("previous",)),
         case("fireflies", "stiff", (1, 3, 4, 5), draw=_radiance),
-        case("out of the image", "extreme", (1, 3, 2, 3), far_out),
-        case("motion unknown", "extreme", (1, 1, 2, 4), unknown),
+        case("out of the image", "extreme", (1, 3, 2, 3), _move_far_out),
+        case("motion unknown", "extreme", (1, 1, 2, 4), _forget_some),
     )
 
 

@@ -121,16 +121,12 @@ def from_before(
     """
     before = own_state(state, Before, frame, channels=channels, keeper=keeper)
     shape = (frame.color.shape[0], channels, *frame.size)
-    reset = ""
     if before is None:
-        reset = "first frame"
-    elif before.image.shape != shape:
-        reset = "size change"
-    elif not has_motion(frame, before.view_projection):
-        reset = "no motion"
-    if before is None or reset:
-        _report(reset, 0.0)
-        return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1])
+        return _nothing(frame, shape, "first frame")
+    if before.image.shape != shape:
+        return _nothing(frame, shape, "size change")
+    if not has_motion(frame, before.view_projection):
+        return _nothing(frame, shape, "no motion")
     motion = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     if sharp and motion is not None:
@@ -140,6 +136,12 @@ def from_before(
     _report("", None)
     tell_history(weight.mean())
     return found, weight
+
+
+def _nothing(frame: Frame, shape: tuple[int, ...], reset: str) -> tuple[Tensor, Tensor]:
+    """The result of :func:`from_before` without a previous image, for the reason ``reset``."""
+    _report(reset, 0.0)
+    return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1])
 
 
 def _report(reset: str, history: float | None) -> None:

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._constants import CUBIC
-from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
-from mcdenoise.ops.temporal import pixel_grid
+from mcdenoise.ops.temporal import places_before
 
 __all__ = ["resample"]
 
@@ -58,14 +57,10 @@ def resample(previous: Tensor, motion: Tensor) -> Tensor:
     """
     height, width = previous.shape[-2:]
     dtype = torch.promote_types(previous.dtype, torch.float32)
-    motion = motion.to(dtype)
-    known = torch.isfinite(motion).all(1, keepdim=True)
-    q = pixel_grid(height, width, motion.device, dtype) + torch.where(known, motion, 0)
-    # Far outside counts as just outside.
-    limit = numbers_like(q, [width, height]).reshape(1, 2, 1, 1)
-    base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -1)), limit)
-    x0, y0 = base.long().split(1, 1)
-    across, down = (_kernel(each) for each in (q - base).clamp(0, 1).split(1, 1))
+    known, base, fraction = places_before(motion, dtype)
+    x0, y0 = base.split(1, 1)
+    # Far outside, all pixels around a place repeat the edge.
+    across, down = (_kernel(each) for each in fraction.clamp(0, 1).split(1, 1))
 
     source = previous.to(dtype).flatten(2)
     value, nearest = torch.zeros_like(previous, dtype=dtype), []

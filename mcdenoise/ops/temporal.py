@@ -70,7 +70,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     in_front = hit & (w > 0)
     scale = numbers_like(position, [width, height], dtype).reshape(1, 2, 1, 1)
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
-    centre = pixel_grid(height, width, position.device, dtype) + 0.5
+    centre = _pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
 
 
@@ -157,15 +157,9 @@ def reproject(
     height, width = previous.shape[-2:]
     dtype = torch.promote_types(previous.dtype, torch.float32)
 
-    known = torch.isfinite(motion).all(1, keepdim=True)
-    motion = torch.where(known, motion.to(dtype), 0)
-    q = pixel_grid(height, width, motion.device, dtype) + motion
-    # Far outside counts as just outside, which is exact as an integer.
-    limit = numbers_like(q, [width + 1, height + 1]).reshape(1, 2, 1, 1)
-    base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
-    fraction = q - base
-    x0, y0 = base[:, :1].long(), base[:, 1:].long()
-    fx, fy = fraction[:, :1], fraction[:, 1:]
+    known, base, fraction = places_before(motion, dtype)
+    x0, y0 = base.split(1, 1)
+    fx, fy = fraction.split(1, 1)
 
     # For each tap, one gather fetches all buffers to compare, and one all values to sum.
     tested = [buffer.to(dtype) for buffer in there if buffer is not None]
@@ -314,7 +308,29 @@ def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> None:
     check_shapes(**images, **({} if motion is None else {"motion": (motion, "B 2 H W")}))
 
 
-def pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+def places_before(motion: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """The place of each pixel in the previous frame, ``q = p + motion[p]``.
+
+    Args:
+        motion: ``(B, 2, H, W)`` pixels.
+        dtype: in which places are computed.
+
+    Returns:
+        ``(B, 1, H, W)`` whether the motion is finite; ``(B, 2, H, W)`` integers, x first, the pixel at or before the
+        place, or one that is far outside with all its neighbours; and ``(B, 2, H, W)`` the rest of the way to the
+        place, in [0, 1) if it is not far outside. Where the motion is not finite, both are those of a motion of zeros.
+    """
+    height, width = motion.shape[-2:]
+    motion = motion.to(dtype)
+    known = torch.isfinite(motion).all(1, keepdim=True)
+    q = _pixel_grid(height, width, motion.device, dtype) + torch.where(known, motion, 0)
+    # Far outside counts as just outside, which is exact as an integer.
+    limit = numbers_like(q, [width + 1, height + 1]).reshape(1, 2, 1, 1)
+    base = torch.minimum(torch.maximum(q.detach().floor(), torch.full_like(limit, -2)), limit)
+    return known, base.long(), q - base
+
+
+def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """``(1, 2, H, W)`` integer pixel indices, x first."""
     # All of kornia comes with it, which takes as long to import as a single frame to denoise.
     from kornia.geometry.grid import create_meshgrid
