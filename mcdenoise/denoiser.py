@@ -20,7 +20,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
-    FILTERED,
     Journal,
     Model,
     Output,
@@ -41,7 +40,7 @@ from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
-from mcdenoise.sampling import sampled_at_centres
+from mcdenoise.sampling import suitable_model
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
@@ -438,7 +437,7 @@ def denoise(
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
     if model is None:
         # Weights and settings are those of the default, and layers are filtered with its kernels.
-        model = DEFAULT if settings or frame.layers or sampled_at_centres(frame) else FILTERED
+        model = DEFAULT if settings or frame.layers else suitable_model(frame)[0]
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()

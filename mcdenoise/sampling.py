@@ -1,10 +1,12 @@
-"""How the renderer sampled the features of a frame, from their values."""
+"""How the renderer sampled a frame, from its values, and which model suits that."""
 
 from __future__ import annotations
 
 import torch
 
 from mcdenoise.frame import Frame
+from mcdenoise.models import DEFAULT, FILTERED
+from mcdenoise.noise import noise_of
 from mcdenoise.ops import motion_from_position
 
 # The medians of 14 shots at pixel centres were at most 0.0044 pixels, which half floats cause; those of 25 of Mitsuba's
@@ -12,6 +14,29 @@ from mcdenoise.ops import motion_from_position
 _NEAR = 0.0065
 # Half floats change the length of a normal by at most 0.001.
 _UNIT, _UNIT_FRACTION = 0.01, 0.98
+# Level of noise (:func:`mcdenoise.noise.noise_of`) above which the errors of cascaded_v2 are smaller at pixel centres:
+# on eight shots, whose noise was reduced step by step, they were so above 0.10 to 0.15 (sponza: always).
+_NOISY = 0.12
+
+
+def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
+    """The name of the model that suits a frame, and the reason in words.
+
+    ``cascaded_v2`` was trained on features sampled at the pixel centres and one sample a pixel, and is best there.
+    Files of a renderer have features through a pixel filter, for which the others were trained.
+
+    Args:
+        frame: ``None`` for one that is known to have features through a filter.
+        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
+    """
+    filtered = "features may be noisy, or filtered over pixels"
+    if frame is not None and sampled_at_centres(frame):
+        noise = noise_of(frame.color, frame.albedo, frame.normal)
+        if cascade or float(noise.level.amax()) > _NOISY:
+            return DEFAULT, "features are sampled at the pixel centres"
+        filtered = "there is little noise"
+    model = "cascaded_v3" if cascade else FILTERED
+    return model, f"{filtered}; oidn_temporal has a smaller error, but takes longer"
 
 
 def sampled_at_centres(frame: Frame) -> bool:

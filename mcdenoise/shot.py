@@ -12,8 +12,8 @@ from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
-from mcdenoise.models import DEFAULT, FILTERED, describe_weights
-from mcdenoise.sampling import sampled_at_centres
+from mcdenoise.models import DEFAULT, describe_weights
+from mcdenoise.sampling import suitable_model
 
 # With very many threads torch crashes instead of raising an error.
 _MOST_THREADS = 1024
@@ -199,27 +199,20 @@ class ShotSettings:
 
 
 def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, str]:
-    """The name of the model that is best for a shot without further measurement, and the reason in words.
-
-    ``cascaded_v2`` was trained on features sampled at the pixel centres, and is best there. Files of a renderer have
-    features through a pixel filter, for which the others were trained. (Blender's positions do not tell: they are those
-    of the first sample, which passes through the centre, whatever the filter is.)
+    """The name of the model that suits a shot, and the reason in words, see :func:`suitable_model`.
 
     Args:
         sequence: the shot; its first frame without damage is read if the layout is one that may have features at the
-            centres.
-        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
+            pixel centres. (Blender's positions do not tell: they are those of the first sample, which passes through
+            the centre, whatever the filter is.)
+        cascade: whether a cascade is required.
     """
     if sequence.layout != "files":
         for number in sequence.numbers:
             # A damaged frame is not for this function to report.
             with suppress(InputError):
-                if sampled_at_centres(sequence.frame(number)):
-                    return DEFAULT, "features are sampled at the pixel centres"
-                break
-    return "cascaded_v3" if cascade else FILTERED, (
-        "features may be noisy, or filtered over pixels; oidn_temporal has a smaller error, but takes longer"
-    )
+                return suitable_model(sequence.frame(number), cascade=cascade)
+    return suitable_model(None, cascade=cascade)
 
 
 def check_threads(threads: int) -> None:

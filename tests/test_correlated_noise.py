@@ -1,4 +1,4 @@
-"""Whether the noise of neighbouring pixels is correlated."""
+"""How much noise a frame has, and whether that of neighbouring pixels is correlated."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise import ops
-from mcdenoise.noise import noise_is_spread
-from mcdenoise.ops._steps.noise import second_differences
+from mcdenoise.noise import noise_is_spread, noise_of
 
 HEIGHT, WIDTH = 192, 320
 ROWS, COLUMNS = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
@@ -69,9 +67,9 @@ def test_a_normal_shows_correlation_of_little_noise(kind: str) -> None:
     # An encoded normal changes as little.
     assert noise_is_spread(through_film(color), albedo, normal / 2 + 0.5)
     assert not noise_is_spread((albedo * smooth).expand(1, 3, -1, -1), albedo, normal)
-    # A normal that is even nowhere tells nothing, so that the noise has to be stronger.
-    assert not noise_is_spread(through_film(color), albedo, torch.rand_like(normal))
+    # A normal that is even nowhere tells nothing, and all pixels count.
     assert noise_is_spread(through_film(albedo * light(0)), albedo, torch.rand_like(normal))
+    assert not noise_is_spread(albedo * light(0), albedo, torch.rand_like(normal))
 
 
 def test_the_correlation_of_many_samples_through_a_tent_is_recognised() -> None:
@@ -95,21 +93,38 @@ def test_an_image_without_noise_has_no_correlated_noise() -> None:
     assert not noise_is_spread(torch.ones(1, 3, 3, 4), None)
 
 
-@pytest.mark.parametrize("channels", [0, 4])
-@pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_compiled_differences_are_those_of_the_reference(channels: int, turned: bool, dtype: torch.dtype) -> None:
-    generator = torch.Generator().manual_seed(3)
-    image = torch.rand(2, 19, 23, generator=generator, dtype=dtype)
-    features = torch.rand(2, channels, 19, 23, generator=generator, dtype=dtype).cumsum(-1) * 0.45
-    if turned:
-        image, features = image.mT, features.mT
-    found = []
-    for backend in ("torch", "numba"):
-        with ops.use(backend):
-            found.append(second_differences(image, features if channels else None, 0.4))
-    for one, other in zip(*found, strict=True):
-        # Differences and means of five values of at most 1, relative to a mean that is hardly below 0.1.
-        torch.testing.assert_close(one, other, rtol=0, atol=100 * torch.finfo(dtype).eps)
-    most = 2 * image.shape[1] * (image.shape[2] - 4)
-    assert len(found[0][0]) == most if channels == 0 else 0 < len(found[0][0]) < most
+def test_both_differences_of_independent_noise_are_equal_in_the_mean() -> None:
+    torch.manual_seed(2)
+    light = 1 + 0.1 * torch.randn(2, 1, 800, 800, dtype=torch.float64)
+    level, spread = noise_of(light.expand(2, 3, -1, -1))
+    # The mean of a normal distribution's modulus is sqrt(2 / pi); `a - 2 c + e` has six times a pixel's variance, and
+    # the sum of five neighbours, one of them twice, is 6.
+    expected = 0.1 * 6**0.5 * (2 / torch.pi) ** 0.5 / 6
+    assert level.shape == spread.shape == (2, 1, 1, 1)
+    # There are 160,000 differences of about a third of independent ones, whose deviation is 0.76 of their mean.
+    assert level.flatten().tolist() == pytest.approx([expected] * 2, rel=5 * 0.76 / (160_000 / 3) ** 0.5 + 0.01)
+    assert spread.flatten().tolist() == [0, 0]
+
+
+def test_the_level_is_relative_and_only_that_of_even_surfaces() -> None:
+    torch.manual_seed(3)
+    albedo = texture("colored")
+    light = 1 + 0.3 * torch.rand(1, 1, HEIGHT, WIDTH)
+    normal = torch.zeros(1, 3, HEIGHT, WIDTH)
+    noise = noise_of(albedo * light, albedo, normal)
+    torch.testing.assert_close(noise_of(albedo * light * 1e4, albedo, normal), noise, rtol=1e-5, atol=0)
+    # Stripes of brighter light have edges of differences of up to 1, which would be noise if the normal did not
+    # show them. Four of 32 pixels are near an edge, with a hundredth of the weight.
+    stripes = (COLUMNS // 32 % 2).to(torch.float32)[None, None]
+    lamps, edges = albedo * light * (1 + 9 * stripes), normal + stripes
+    assert float(noise_of(lamps, albedo, edges).level) == pytest.approx(float(noise.level), abs=0.01 * 4 / 28 + 0.002)
+    assert float(noise_of(lamps, albedo, normal).level) > float(noise.level) + 0.01
+
+
+def test_images_of_a_batch_have_their_own_noise() -> None:
+    color, albedo = torch.cat([through_film(light(0)), light(1)]), torch.ones(2, 3, HEIGHT, WIDTH)
+    both = noise_of(color, albedo, albedo)
+    for i in range(2):
+        alone = noise_of(color[i : i + 1], albedo[:1], albedo[:1])
+        torch.testing.assert_close([each[i : i + 1] for each in both], [*alone], rtol=1e-5, atol=1e-6)
+    assert [float(each) for each in both.spread] == [1, 0]

@@ -14,7 +14,7 @@ from mcdenoise import denoise
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame
-from mcdenoise.sampling import sampled_at_centres
+from mcdenoise.sampling import sampled_at_centres, suitable_model
 from mcdenoise.shot import ShotSettings, default_model
 
 HEIGHT, WIDTH = 30, 40
@@ -29,7 +29,7 @@ def floor_seen_at(offset: Tensor) -> Frame:
     depth = 3 / (1 - x)
     normal = torch.tensor([2**-0.5, 0, -(2**-0.5)]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
     return Frame(
-        torch.rand(1, 3, HEIGHT, WIDTH),
+        torch.rand(1, 3, HEIGHT, WIDTH) ** 4,  # as noisy as with some four samples a pixel
         normal=normal,
         depth=depth[:, None],
         position=torch.stack([x * depth, y * depth, depth], 1),
@@ -60,6 +60,18 @@ def test_normals_of_more_than_one_point_count_as_a_filter() -> None:
     assert not sampled_at_centres(frame.replace(normal=mixed))
 
 
+def test_at_pixel_centres_the_noise_decides() -> None:
+    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    clean = frame.replace(color=torch.full_like(frame.color, 0.5))
+    assert suitable_model(frame)[0] == "cascaded_v2"
+    assert suitable_model(clean) == (
+        "oidn_tuned",
+        "there is little noise; oidn_temporal has a smaller error, but takes longer",
+    )
+    # The settings of its history require a cascade.
+    assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
+
+
 @pytest.mark.parametrize("missing", ["position", "view_projection", "normal"])
 def test_without_positions_camera_or_normal_the_answer_is_no(missing: str) -> None:
     assert not sampled_at_centres(floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH)).replace(**{missing: None}))
@@ -70,13 +82,20 @@ def test_positions_that_are_nowhere_are_no_evidence() -> None:
     assert not sampled_at_centres(frame.replace(position=torch.full_like(frame.position, torch.inf)))
 
 
-def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
+@pytest.fixture
+def lab(small_sequence: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A sequence at pixel centres that counts as noisy, though half of each image is a sky without noise."""
+    monkeypatch.setattr("mcdenoise.sampling._NOISY", 0.03)
+    return small_sequence
+
+
+def test_the_layout_of_a_lab_is_examined(lab: Path) -> None:
+    sequence = open_sequence(lab)
     assert default_model(sequence) == ("cascaded_v2", "features are sampled at the pixel centres")
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
     # A damaged frame is reported when it is denoised, and does not change the choice.
-    (small_sequence / "inputs" / "color0.exr").write_bytes(b"damaged")
+    (lab / "inputs" / "color0.exr").write_bytes(b"damaged")
     assert default_model(sequence)[0] == "cascaded_v2"
 
 
@@ -95,12 +114,10 @@ def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> No
         chosen.denoiser()
 
 
-def test_the_command_says_what_it_picked(
-    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_what_it_picked(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def printed(*options: str) -> str:
         with pytest.raises(SystemExit) as stop:
-            main(["denoise", str(small_sequence), "-o", str(tmp_path / str(len(options))), *options])
+            main(["denoise", str(lab), "-o", str(tmp_path / str(len(options))), *options])
         assert stop.value.code in (0, None)
         return capsys.readouterr().out
 

@@ -5,16 +5,20 @@ image even where the input is clean. Here the same layers, which start with the 
 the previous result, reprojected, and predict for every pixel which of four images to trust: the network's own; the
 previous result in both forms of :class:`mcdenoise.models.Recurrent`; and the noisy pixels, which are right where there
 is no noise. Training on two renderers, with noisy and with exact features and 1 to 64 samples, replaces the settings.
-:class:`mcdenoise.models.Restored` around it gives back the detail of nearly clean frames.
+Since the library's own weights are better for little independent noise, the network of a frame has weights between
+these and the trained ones, according to its noise. :class:`mcdenoise.models.Restored` around it gives back the detail
+of nearly clean frames.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
@@ -25,6 +29,7 @@ from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
+from mcdenoise.noise import noise_of
 from mcdenoise.ops._steps.tuned import tuned_choice, tuned_input
 from mcdenoise.ops._window import corner
 
@@ -32,6 +37,9 @@ from mcdenoise.ops._window import corner
 _CHANNELS = 9 + 3 + 3 + 1
 # Initial logits of the network's image, of the previous result in both forms, and of the noisy pixels.
 _LOGITS = (0.0, -2.0, -2.0, -7.0)
+# Fraction of the weights before the training: at the most, how it falls with the level of noise, and at the least. For
+# correlated noise, which those weights do not remove, it is smaller.
+_MOST, _FALL, _LEAST, _SPREAD = 1.1, 2.0, 0.4, 0.6
 
 
 class TunedNetwork(nn.Module):
@@ -40,6 +48,12 @@ class TunedNetwork(nn.Module):
     ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, v, v, 1)``, where ``v`` is the
     fraction of the previous frame that shows the same surface. So without a history the previous result has no weight.
 
+    In evaluation, the weights of its layers are ``(1 - f) trained + f start``, where ``start`` are the weights before
+    the training: means of both are better on frames unlike those that were trained on (Wortsman et al. 2022, "Robust
+    fine-tuning of zero-shot models", CVPR). Of a frame with noise of level n and spread s, see
+    :func:`mcdenoise.noise.noise_of`, the fraction is ``f = max(clamp(1.1 - 2 n, 0.4, 1) - 0.6 s, 0)``. It is 0 if the
+    training did not begin with the weights of a model (:func:`mcdenoise.models.start_with`).
+
     It has to be wrapped in :class:`mcdenoise.models.Recurrent`. A missing albedo counts as one, a missing normal as
     zero.
 
@@ -47,9 +61,13 @@ class TunedNetwork(nn.Module):
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
     """
 
+    kept: Tensor  # 1 if there are weights before the training, else 0
+
     def __init__(self, size: Size = "base") -> None:
         super().__init__()
         self.unet = OidnUNet(_CHANNELS, size, out_channels=3 + len(_LOGITS))
+        self.start = copy.deepcopy(self.unet).requires_grad_(False)
+        self.register_buffer("kept", torch.zeros(()))
 
     @property
     def needs(self) -> Needs:
@@ -58,8 +76,16 @@ class TunedNetwork(nn.Module):
         return Needs(uses=uses, reach=self.unet.reach, stride=self.unet.multiple)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The exposure of the whole image."""
-        return {"oidn_exposure": oidn_exposure(frame.color)}
+        """The exposure of the whole image, and the fraction of the initial weights for its noise."""
+        level, spread = noise_of(frame.color, frame.albedo, frame.normal)
+        fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1) - _SPREAD * spread).clamp_min(0)
+        return {"oidn_exposure": oidn_exposure(frame.color), "start_fraction": fraction * self.kept}
+
+    def keep_start(self) -> None:
+        """Keep the present weights as those before the training, unless there are such weights already."""
+        if not self.kept:
+            self.start.load_state_dict(self.unet.state_dict())
+            self.kept.fill_(1)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
@@ -68,15 +94,27 @@ class TunedNetwork(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         color = frame.color
-        exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
+        statistics = frame.statistics or self.statistics(frame)
+        exposure = statistics["oidn_exposure"]
         before, light = (frame.extra.get(name, torch.zeros_like(color)) for name in (PREVIOUS, PREVIOUS_LIGHT))
         valid = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(color[:, :1]))
         with timed("network", color.device):
             buffers = (color, before, light, frame.albedo, frame.normal, valid, exposure)
             seen, images = tuned_input(*buffers, self.unet.multiple)
-            predicted = corner(self.unet(seen), *frame.size)
+            predicted = corner(self._predicted(seen, statistics["start_fraction"]), *frame.size)
             image = tuned_choice(predicted, images, valid, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image, None), None
+
+    def _predicted(self, seen: Tensor, fractions: Tensor) -> Tensor:
+        """The result of the network for ``(B, 16, H, W)``, with weights for each image."""
+        if self.training:
+            return self.unet(seen)  # type: ignore[no-any-return]
+        found, start = [], list(self.start.parameters())
+        for image, fraction in zip(seen.split(1), fractions.flatten(), strict=True):
+            pairs = zip(self.unet.named_parameters(), start, strict=True)
+            weights = {name: torch.lerp(own, other, fraction.to(own.dtype)) for (name, own), other in pairs}
+            found.append(functional_call(self.unet, weights, (image,)))
+        return torch.cat(found) if len(found) > 1 else found[0]
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

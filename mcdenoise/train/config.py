@@ -31,9 +31,6 @@ class TrainConfig:
             weights.
         start_from: a model with weights, which the layers of the same names start with, such as cascaded_v2 or
             oidn_open(quality=fast); all by default start with random weights.
-        start_fraction: fraction of the weights of start_from in the result, which is the weighted mean of these and of
-            the trained ones (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"); for a start that was
-            trained on far more scenes.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
         loss: loss of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et
@@ -74,7 +71,6 @@ class TrainConfig:
     settings: str = ""
     width: int = 0
     start_from: str = ""
-    start_fraction: float = 0.0
     losses: str = ""
     loss: Loss = "smape"
     steps: int = 10_000
@@ -169,11 +165,9 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
     if not 0 <= config.ema < 1:
         raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    for name in ("lamps", "gloss", "less_noise", "start_fraction"):
+    for name in ("lamps", "gloss", "less_noise"):
         if not 0 <= settings[name] <= 1:
             raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
-    if config.start_fraction and not config.start_from:
-        raise InputError("start_fraction: expected a model in start_from, found none")
     _ = config.model_settings, config.loss_weights
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 import threading
@@ -214,8 +213,6 @@ class Trainer:
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
         self.model, self.stepper = fabric.setup(Unrolled(split(network)[1], has_state=has_state), self.optimizer)
         self.average = _moving_average(network, config.ema) if config.ema else None
-        # Before a checkpoint is loaded, these are the weights that the run starts with.
-        self.start = [weight.detach().clone() for weight in network.parameters()] if config.start_fraction else []
 
     @property
     def parts(self) -> list[Any]:
@@ -226,14 +223,7 @@ class Trainer:
     @property
     def result(self) -> Any:
         """The model to validate and to save."""
-        trained = self.network if self.average is None else self.average.module
-        if not self.start:
-            return trained
-        mixed = copy.deepcopy(trained)
-        with torch.no_grad():
-            for weight, start in zip(mixed.parameters(), self.start, strict=True):
-                weight.lerp_(start, self.config.start_fraction)
-        return mixed
+        return self.network if self.average is None else self.average.module
 
     def seeds(self, step: int) -> list[int]:
         """Seeds of this process's clips in a step; those of all processes together are the same as for one process."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.util
 
 import pytest
@@ -13,6 +14,7 @@ from mcdenoise.models import create_model, start_with
 from mcdenoise.models.oidn_tuned import _LOGITS, TunedNetwork
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.noise import noise_of
 from mcdenoise.ops._steps.transfer import compress, expand
 
 SIZE = (26, 38)
@@ -112,4 +114,71 @@ def test_derivatives(weight: float) -> None:
 
     assert torch.autograd.gradcheck(run, (color,), fast_mode=True)
     run(color).sum().backward()
-    assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in model.parameters())
+    assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in model.unet.parameters())
+    assert all(weight.grad is None for weight in model.start.parameters())
+
+
+def started() -> TunedNetwork:
+    """A network in float64 that was changed after its weights were kept."""
+    torch.manual_seed(0)
+    model = TunedNetwork("small").double().eval()
+    model.keep_start()
+    with torch.no_grad():
+        for weight in model.unet.parameters():
+            weight += 0.02 * torch.randn_like(weight)
+    return model
+
+
+def test_the_weights_of_each_image_are_mixed_according_to_its_noise() -> None:
+    model, frame = started(), given(0.5)
+    noisy, torch_state = frame.color, torch.Generator().manual_seed(4)
+    clean = torch.full_like(noisy, 0.5) + 1e-3 * torch.rand(noisy.shape, generator=torch_state, dtype=noisy.dtype)
+    for color in (noisy, clean):
+        level, spread = (float(each) for each in noise_of(color, frame.albedo, frame.normal))
+        fraction = max(min(max(1.1 - 2 * level, 0.4), 1) - 0.6 * spread, 0)
+        mixed = copy.deepcopy(model)
+        with torch.no_grad():
+            for weight, start in zip(mixed.unet.parameters(), model.start.parameters(), strict=True):
+                weight.copy_((1 - fraction) * weight + fraction * start)
+        expected = mixed.train()(frame.replace(color=color))[0].image
+        torch.testing.assert_close(model(frame.replace(color=color))[0].image, expected, rtol=1e-10, atol=1e-12)
+    parts = [model(frame.replace(color=color))[0].image for color in (noisy, clean)]
+    both = frame.map(lambda buffer: torch.cat([buffer, buffer])).replace(color=torch.cat([noisy, clean]))
+    together = model(both.replace(extra={name: torch.cat([each] * 2) for name, each in frame.extra.items()}))[0].image
+    torch.testing.assert_close(together, torch.cat(parts), rtol=1e-10, atol=1e-12)
+    assert not torch.allclose(model.train()(frame)[0].image, parts[0])
+
+
+def test_without_weights_before_the_training_nothing_is_mixed() -> None:
+    torch.manual_seed(0)
+    model, frame = TunedNetwork("small").double().eval(), given(0.5)
+    with torch.no_grad():
+        model.unet.last.bias += 0.1
+    alone = model.train()(frame)[0].image
+    assert torch.equal(model.eval()(frame)[0].image, alone)
+
+
+def test_the_weights_before_the_training_are_kept_once() -> None:
+    model = started()
+    start = copy.deepcopy(model.start.state_dict())
+    model.keep_start()
+    assert all(torch.equal(tensor, start[name]) for name, tensor in model.start.state_dict().items())
+
+
+@has_oidn
+def test_weights_before_the_training_are_those_of_the_library() -> None:
+    model, library = create_model("oidn_tuned_small"), create_model("oidn_open", quality="fast")
+    start_with(model, "oidn_open", quality="fast")
+    network = next(part for part in model.modules() if isinstance(part, TunedNetwork))
+    own = library.state_dict()["inner.unet.encoder.1.0.weight"]
+    assert float(network.kept) == 1
+    assert torch.equal(network.start.encoder[1][0].weight, own)
+    # A run that goes on with trained weights keeps those before the first.
+    with torch.no_grad():
+        network.unet.encoder[1][0].weight.mul_(2)
+    start_with(model, "oidn_tuned_small")
+    shipped = next(
+        part for part in create_model("oidn_tuned_small", pretrained=True).modules() if isinstance(part, TunedNetwork)
+    )
+    assert torch.equal(network.start.encoder[1][0].weight, shipped.start.encoder[1][0].weight)
+    assert not torch.equal(network.unet.encoder[1][0].weight, network.start.encoder[1][0].weight)

@@ -693,22 +693,6 @@ def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> N
     assert "data.json" in message
 
 
-def test_the_result_is_the_mean_of_trained_weights_and_those_of_the_start(small_sequence: Path, tmp_path: Path) -> None:
-    name = "cascaded_v2_micro"
-    own = {**SMALL, "steps": 2, "width": 0, "model": name, "start_from": name, "learning_rate": 1e-2}
-    found = {}
-    for fraction in (0.0, 0.25):
-        config = TrainConfig(**own, start_fraction=fraction)
-        found[fraction] = load_weights(train(config, [small_sequence], tmp_path / str(fraction))).state_dict()
-    for key, start in create_model(name, pretrained=True).state_dict().items():
-        expected = torch.lerp(found[0.0][key], start, 0.25)
-        # Every file is rounded to half precision.
-        torch.testing.assert_close(found[0.25][key], expected, rtol=2.0**-10, atol=2.0**-14)
-        assert not torch.equal(found[0.25][key], start)
-    message = refused(lambda: train(TrainConfig(**SMALL, start_fraction=0.5), [small_sequence], tmp_path / "none"))
-    assert "start_fraction: expected a model in start_from, found none" in message
-
-
 def test_weights_of_another_width_are_gone_on_with(small_sequence: Path, tmp_path: Path) -> None:
     """The run does not state a width; its result must, so that it can be loaded."""
     first = train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], tmp_path / "first")
