@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
@@ -59,12 +60,19 @@ class TunedNetwork(nn.Module):
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
+        fraction: f for all frames, in [0, 1]; ``None`` for that of the frame's noise.
+
+    Raises:
+        InputError: ``fraction`` is outside [0, 1].
     """
 
     kept: Tensor  # 1 if there are weights before the training, else 0
 
-    def __init__(self, size: Size = "base") -> None:
+    def __init__(self, size: Size = "base", fraction: float | None = None) -> None:
         super().__init__()
+        if fraction is not None and not 0 <= fraction <= 1:
+            raise InputError(f"fraction: expected in [0, 1], found {fraction}")
+        self.fraction = fraction
         self.unet = OidnUNet(_CHANNELS, size, out_channels=3 + len(_LOGITS))
         self.start = copy.deepcopy(self.unet).requires_grad_(False)
         self.register_buffer("kept", torch.zeros(()))
@@ -77,9 +85,13 @@ class TunedNetwork(nn.Module):
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image, and the fraction of the initial weights for its noise."""
-        level, spread = noise_of(frame.color, frame.albedo, frame.normal)
-        fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1) - _SPREAD * spread).clamp_min(0)
-        return {"oidn_exposure": oidn_exposure(frame.color), "start_fraction": fraction * self.kept}
+        exposure = oidn_exposure(frame.color)
+        if self.fraction is None:
+            level, spread = noise_of(frame.color, frame.albedo, frame.normal)
+            fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1) - _SPREAD * spread).clamp_min(0)
+        else:
+            fraction = torch.full_like(exposure, self.fraction)
+        return {"oidn_exposure": exposure, "start_fraction": fraction * self.kept}
 
     def keep_start(self) -> None:
         """Keep the present weights as those before the training, unless there are such weights already."""
@@ -123,14 +135,18 @@ _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
-def _tuned(size: Size = "base", *, restore: bool = True) -> Model:
+def _tuned(size: Size = "base", *, fraction: float | None = None, restore: bool = True) -> Model:
     """The network with its memory.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
+        fraction: see :class:`TunedNetwork`.
         restore: whether :class:`mcdenoise.models.Restored` gives back detail.
+
+    Raises:
+        InputError: ``fraction`` is outside [0, 1].
     """
-    model = Recurrent(Tiled(TunedNetwork(size)))
+    model = Recurrent(Tiled(TunedNetwork(size, fraction)))
     return Restored(model) if restore else model
 
 

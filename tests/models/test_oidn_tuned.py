@@ -149,6 +149,19 @@ def test_the_weights_of_each_image_are_mixed_according_to_its_noise() -> None:
     assert not torch.allclose(model.train()(frame)[0].image, parts[0])
 
 
+def test_the_fraction_can_be_set() -> None:
+    model, frame = started(), given(0.5)
+    model.fraction = 0.0
+    own = model(frame)[0].image
+    torch.testing.assert_close(own, model.train()(frame)[0].image, rtol=1e-10, atol=1e-12)
+    model.eval().fraction = 1.0
+    start = model(frame)[0].image
+    model.unet.load_state_dict(model.start.state_dict())
+    torch.testing.assert_close(start, model.train()(frame)[0].image, rtol=1e-10, atol=1e-12)
+    assert not torch.allclose(own, start)
+    assert refused(lambda: create_model("oidn_tuned", fraction=1.5)) == "fraction: expected in [0, 1], found 1.5"
+
+
 def test_without_weights_before_the_training_nothing_is_mixed() -> None:
     torch.manual_seed(0)
     model, frame = TunedNetwork("small").double().eval(), given(0.5)
