@@ -22,6 +22,8 @@ _FOURTH = sqrt(70 / 6)
 # The ratio was at least 0.95 with independent noise, and at most 0.89 with Gaussian, Mitchell and tent filters, on 78
 # shots of Mitsuba and Cycles.
 _RATIO = (0.95, 0.85)
+# Sum of differences that is added to both, so that few pixels tell nothing.
+_FEW = 20.0
 # Smallest difference that is noise, and the fraction of noisy pixels below which differences are those of the scene.
 # Without a normal, which shows edges, differences of scenes are larger.
 _LEAST, _LEAST_ALONE, _NOISY = 0.005, 0.04, (0.65, 0.8)
@@ -61,7 +63,7 @@ def noise_of(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None 
     known, least = albedo is not None, _LEAST_ALONE if normal is None else _LEAST
     sums = _sums(*rows, known=known, least=least) + _sums(*columns, known=known, least=least)
     count, level, noisy, near, wide = sums.clamp_min(LEAST_SUM).split(1, 1)
-    return Noise(level / count, _between(near / wide, *_RATIO) * _between(noisy / count, *_NOISY))
+    return Noise(level / count, _between((near + _FEW) / (wide + _FEW), *_RATIO) * _between(noisy / count, *_NOISY))
 
 
 def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None = None) -> bool:
