@@ -410,8 +410,8 @@ def denoise(
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
         model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if positions, camera and normal tell that the
-            features were sampled at the pixel centres, or if layers, weights or settings are passed; otherwise
-            ``"oidn_tuned"``.
+            features were sampled at the pixel centres and there is much noise, or if layers, weights or settings are
+            passed; otherwise ``"oidn_tuned"``.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
         extra: further buffers by name.

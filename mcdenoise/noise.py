@@ -11,30 +11,31 @@ from torch import Tensor
 
 from mcdenoise.ops._constants import LEAST_SUM
 
-_DARKEST = 0.02  # smallest albedo to divide by
+_DARKEST, _BRIGHTEST = 0.02, 1e16  # smallest albedo to divide by, and largest radiance
 _EVERY = 8  # rows and columns are examined at this distance
 # Where a feature changes by this from pixel to pixel, differences may be those of the scene: their weight is the least.
 _EVEN, _UNEVEN = 0.02, 0.01
-# A difference d counts as d / (d + 0.1), so that edges and fireflies do not outweigh the rest.
-_LARGE = 0.1
+# Smaller differences are rounding errors. Edges and fireflies should not outweigh the rest.
+_ROUNDED, _LARGE = 1e-6, 0.1
 # Fourth differences of independent noise of variance 1 have the variance 70, second differences 6.
 _FOURTH = sqrt(70 / 6)
-# The ratio was at least 0.95 with independent noise, and at most 0.89 with Gaussian, Mitchell and tent filters, on 78
-# shots of Mitsuba and Cycles.
-_RATIO = (0.95, 0.85)
+# Limits of the ratio of both differences. On shots of Mitsuba and Cycles, none of 104 with independent noise then has a
+# spread of more than 0.5, and 35 of 40 with Gaussian, Mitchell and tent filters have; a nearly clean one and
+# small ones with few even surfaces are missed.
+_RATIO = (0.95, 0.87)
 # Sum of differences that is added to both, so that few pixels tell nothing.
 _FEW = 20.0
-# Smallest difference that is noise, and the fraction of noisy pixels below which differences are those of the scene.
-# Without a normal, which shows edges, differences of scenes are larger.
-_LEAST, _LEAST_ALONE, _NOISY = 0.005, 0.04, (0.65, 0.8)
+# Smallest difference that is noise, and limits of the fraction of noisy pixels, below which differences are those of
+# the scene. Without a normal, which shows edges, differences of scenes are larger.
+_LEAST, _LEAST_ALONE, _COMMON = 0.005, 0.04, (0.7, 0.8)
 
 
 class Noise(NamedTuple):
     """Noise of a frame.
 
     Args:
-        level: ``(B, 1, 1, 1)`` typical relative difference of pixels: 0.35 to 0.5 with one sample a pixel, 0.1 with
-            some ten, below 0.04 for nearly clean frames; details of the scene count, too.
+        level: ``(B, 1, 1, 1)`` in [0, 1], the typical relative difference of pixels. It is 0.2 to 0.6 with one sample a
+            pixel, about 0.15 with four, 0.08 with 16, and below 0.05 from 64 on. Details of the scene count, too.
         spread: ``(B, 1, 1, 1)`` from 0, for independent noise, to 1, for noise that neighbouring pixels share, because
             the film's filter counts each sample in several of them.
     """
@@ -46,30 +47,38 @@ class Noise(NamedTuple):
 def noise_of(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None) -> Noise:
     """Measure the noise of a frame, without a read of values on the host.
 
-    Of five neighbours a to e of a row or column of the demodulated radiance, let ``m = a + b + 2 c + d + e``,
-    ``near = sqrt(6 / 70) |a - 4 b + 6 c - 4 d + e| / m`` and ``wide = |a - 2 c + e| / m``. Where albedo and normal are
-    even, the mean of ``wide`` is the level. Both differences are equal in the mean if the noise of pixels is
-    independent, and ``near`` is smaller if neighbours share it. Smooth shading has small fourth differences.
+    Of five neighbours a to e in every eighth row and column of the demodulated radiance, with their sum
+    ``m = a + b + 2 c + d + e``, the differences are ``near = sqrt(6 / 70) |a - 4 b + 6 c - 4 d + e| / m`` and
+    ``wide = |a - 2 c + e| / m``. Both are equal in the mean if the noise of pixels is independent, and ``near`` is
+    smaller if neighbours share it. Smooth shading has small fourth differences.
+
+    With weights ``w = max(1 - g / 0.02, 0.01)``, where g is the largest change of a feature between neighbours, and
+    0 where both differences are 0, as in a black background, the level is ``sum(w wide) / sum(w)``. With ``S(x) = 20 +
+    sum(w x / (x + 0.1))`` the spread rises from 0 to 1 while ``S(near) / S(wide)`` falls from 0.95 to 0.87, times the
+    same for the fraction of pixels with ``wide`` above 0.005 (0.04 without a normal), which has to rise from 0.7 to
+    0.8: in clean images both differences are those of the scene.
 
     Args:
-        color: ``(B, 3, H, W)`` noisy radiance, finite.
-        albedo: ``(B, 3, H, W)``, finite; ``None`` if there is none.
+        color: ``(B, 3, H, W)`` noisy radiance; invalid values count as 0.
+        albedo: ``(B, 3, H, W)``; ``None`` if there is none.
         normal: likewise, in any encoding.
     """
     dtype = torch.promote_types(color.dtype, torch.float32)
     images = [each.detach() for each in (color, albedo, normal) if each is not None]
-    rows = [each[..., ::_EVERY, :].to(dtype) for each in images]
-    columns = [each[..., ::_EVERY].mT.to(dtype) for each in images]
+    rows = [_valid(each[..., ::_EVERY, :].to(dtype)) for each in images]
+    columns = [_valid(each[..., ::_EVERY].mT.to(dtype)) for each in images]
     known, least = albedo is not None, _LEAST_ALONE if normal is None else _LEAST
     sums = _sums(*rows, known=known, least=least) + _sums(*columns, known=known, least=least)
-    count, level, noisy, near, wide = sums.clamp_min(LEAST_SUM).split(1, 1)
-    return Noise(level / count, _between((near + _FEW) / (wide + _FEW), *_RATIO) * _between(noisy / count, *_NOISY))
+    count, level, noisy, near, wide = sums.split(1, 1)
+    count = count.clamp_min(LEAST_SUM)
+    spread = _between((near + _FEW) / (wide + _FEW), *_RATIO) * _between(noisy / count, *_COMMON)
+    return Noise(level / count, spread)
 
 
 def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None = None) -> bool:
     """Whether neighbouring pixels have correlated noise; see :func:`noise_of` for the arguments.
 
-    The answer is read on the host. It is no for nearly clean frames.
+    The answer is read on the host. It is yes if any image of a batch has such noise, and no for nearly clean frames.
     """
     return bool(noise_of(color, albedo, normal).spread.amax() > 0.5)
 
@@ -80,7 +89,9 @@ def _sums(color: Tensor, *features: Tensor, known: bool, least: float) -> Tensor
     These are the weights of the pixels, ``wide``, the weights of those where it is above ``least``, and both
     differences as far as they count. ``known`` tells whether the first of the features is the albedo.
     """
-    light = color / features[0].clamp_min(_DARKEST) if known else color
+    light = color.clamp_min(0)
+    if known:
+        light = light / features[0].clamp_min(_DARKEST)
     a, b, c, d, e = _padded(light.mean(1, keepdim=True)).unfold(-1, 5, 1).unbind(-1)
     mean = (a + b + 2 * c + d + e).clamp_min(LEAST_SUM)
     near = (a - 4 * b + 6 * c - 4 * d + e).abs() / (_FOURTH * mean)
@@ -89,8 +100,13 @@ def _sums(color: Tensor, *features: Tensor, known: bool, least: float) -> Tensor
     if features:
         steps = _padded(torch.cat(features, 1)).diff(dim=-1).abs().amax(1, keepdim=True)
         weight = (1 - steps.unfold(-1, 4, 1).amax(-1) / _EVEN).clamp_min(_UNEVEN)
+    weight = weight * (near + wide > _ROUNDED)
     counted = (torch.ones_like(wide), wide, wide > least, *(each / (each + _LARGE) for each in (near, wide)))
     return torch.cat([(weight * each).sum((1, 2, 3), keepdim=True) for each in counted], 1)
+
+
+def _valid(image: Tensor) -> Tensor:
+    return image.nan_to_num(0.0).clamp(-_BRIGHTEST, _BRIGHTEST)
 
 
 def _padded(rows: Tensor) -> Tensor:

@@ -14,9 +14,9 @@ from mcdenoise.ops import motion_from_position
 _NEAR = 0.0065
 # Half floats change the length of a normal by at most 0.001.
 _UNIT, _UNIT_FRACTION = 0.01, 0.98
-# Level of noise (:func:`mcdenoise.noise.noise_of`) above which the errors of cascaded_v2 are smaller at pixel centres:
-# on eight shots, whose noise was reduced step by step, they were so above 0.10 to 0.15 (sponza: always).
-_NOISY = 0.12
+# Level of noise (:func:`mcdenoise.noise.noise_of`) of frames with some four samples a pixel. On eight shots at pixel
+# centres, whose noise was reduced step by step, cascaded_v2 was better above 0.1 to 0.17 (on sponza always).
+_MANY_SAMPLES = 0.15
 
 
 def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
@@ -29,14 +29,13 @@ def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, 
         frame: ``None`` for one that is known to have features through a filter.
         cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
     """
-    filtered = "features may be noisy, or filtered over pixels"
+    reason = "features may be noisy, or filtered over pixels"
     if frame is not None and sampled_at_centres(frame):
-        noise = noise_of(frame.color, frame.albedo, frame.normal)
-        if cascade or float(noise.level.amax()) > _NOISY:
+        if cascade or float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
             return DEFAULT, "features are sampled at the pixel centres"
-        filtered = "there is little noise"
+        reason = "there is little noise"
     model = "cascaded_v3" if cascade else FILTERED
-    return model, f"{filtered}; oidn_temporal has a smaller error, but takes longer"
+    return model, f"{reason}; oidn_temporal has a smaller error, but takes longer"
 
 
 def sampled_at_centres(frame: Frame) -> bool:

@@ -82,20 +82,13 @@ def test_positions_that_are_nowhere_are_no_evidence() -> None:
     assert not sampled_at_centres(frame.replace(position=torch.full_like(frame.position, torch.inf)))
 
 
-@pytest.fixture
-def lab(small_sequence: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A sequence at pixel centres that counts as noisy, though half of each image is a sky without noise."""
-    monkeypatch.setattr("mcdenoise.sampling._NOISY", 0.03)
-    return small_sequence
-
-
-def test_the_layout_of_a_lab_is_examined(lab: Path) -> None:
-    sequence = open_sequence(lab)
+def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
     assert default_model(sequence) == ("cascaded_v2", "features are sampled at the pixel centres")
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
     # A damaged frame is reported when it is denoised, and does not change the choice.
-    (lab / "inputs" / "color0.exr").write_bytes(b"damaged")
+    (small_sequence / "inputs" / "color0.exr").write_bytes(b"damaged")
     assert default_model(sequence)[0] == "cascaded_v2"
 
 
@@ -114,10 +107,12 @@ def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> No
         chosen.denoiser()
 
 
-def test_the_command_says_what_it_picked(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_what_it_picked(
+    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def printed(*options: str) -> str:
         with pytest.raises(SystemExit) as stop:
-            main(["denoise", str(lab), "-o", str(tmp_path / str(len(options))), *options])
+            main(["denoise", str(small_sequence), "-o", str(tmp_path / str(len(options))), *options])
         assert stop.value.code in (0, None)
         return capsys.readouterr().out
 

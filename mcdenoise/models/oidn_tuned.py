@@ -53,7 +53,8 @@ class TunedNetwork(nn.Module):
     the training: means of both are better on frames unlike those that were trained on (Wortsman et al. 2022, "Robust
     fine-tuning of zero-shot models", CVPR). Of a frame with noise of level n and spread s, see
     :func:`mcdenoise.noise.noise_of`, the fraction is ``f = max(clamp(1.1 - 2 n, 0.4, 1) - 0.6 s, 0)``. It is 0 if the
-    training did not begin with the weights of a model (:func:`mcdenoise.models.start_with`).
+    training did not begin with the weights of a model (:func:`mcdenoise.models.start_with`). Each image of a batch has
+    its own fraction; in a compiled or exported graph all have the mean.
 
     It has to be wrapped in :class:`mcdenoise.models.Recurrent`. A missing albedo counts as one, a missing normal as
     zero.
@@ -74,7 +75,7 @@ class TunedNetwork(nn.Module):
             raise InputError(f"fraction: expected in [0, 1], found {fraction}")
         self.fraction = fraction
         self.unet = OidnUNet(_CHANNELS, size, out_channels=3 + len(_LOGITS))
-        self.start = copy.deepcopy(self.unet).requires_grad_(False)
+        self.start = _with_buffers(copy.deepcopy(self.unet))
         self.register_buffer("kept", torch.zeros(()))
 
     @property
@@ -86,11 +87,12 @@ class TunedNetwork(nn.Module):
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image, and the fraction of the initial weights for its noise."""
         exposure = oidn_exposure(frame.color)
-        if self.fraction is None:
+        fixed = 0.0 if self.training else self.fraction
+        if fixed is not None:
+            fraction = torch.full_like(exposure, fixed)
+        else:
             level, spread = noise_of(frame.color, frame.albedo, frame.normal)
             fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1) - _SPREAD * spread).clamp_min(0)
-        else:
-            fraction = torch.full_like(exposure, self.fraction)
         return {"oidn_exposure": exposure, "start_fraction": fraction * self.kept}
 
     def keep_start(self) -> None:
@@ -121,12 +123,25 @@ class TunedNetwork(nn.Module):
         """The result of the network for ``(B, 16, H, W)``, with weights for each image."""
         if self.training:
             return self.unet(seen)  # type: ignore[no-any-return]
-        found, start = [], list(self.start.parameters())
-        for image, fraction in zip(seen.split(1), fractions.flatten(), strict=True):
+        # A graph for any number of images cannot have weights for each.
+        single = torch.compiler.is_compiling() or len(seen) == 1 or self.fraction is not None
+        parts = [(seen, fractions.mean())] if single else zip(seen.split(1), fractions.flatten(), strict=True)
+        start = list(self.start.buffers())
+        found = []
+        for images, fraction in parts:
             pairs = zip(self.unet.named_parameters(), start, strict=True)
             weights = {name: torch.lerp(own, other, fraction.to(own.dtype)) for (name, own), other in pairs}
-            found.append(functional_call(self.unet, weights, (image,)))
+            found.append(functional_call(self.unet, weights, (images,)))
         return torch.cat(found) if len(found) > 1 else found[0]
+
+
+def _with_buffers(module: nn.Module) -> nn.Module:
+    """A module whose parameters are buffers, which are not trained and not counted."""
+    for part in module.modules():
+        for name, weight in list(part.named_parameters(recurse=False)):
+            delattr(part, name)
+            part.register_buffer(name, weight.detach())
+    return module
 
 
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (

@@ -9,6 +9,7 @@ import pytest
 import torch
 from toys import frame_of, refused
 
+from mcdenoise.export import Step, traced
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
 from mcdenoise.models.oidn_tuned import _LOGITS, TunedNetwork
@@ -115,7 +116,6 @@ def test_derivatives(weight: float) -> None:
     assert torch.autograd.gradcheck(run, (color,), fast_mode=True)
     run(color).sum().backward()
     assert all(weight.grad is not None and weight.grad.isfinite().all() for weight in model.unet.parameters())
-    assert all(weight.grad is None for weight in model.start.parameters())
 
 
 def started() -> TunedNetwork:
@@ -138,7 +138,7 @@ def test_the_weights_of_each_image_are_mixed_according_to_its_noise() -> None:
         fraction = max(min(max(1.1 - 2 * level, 0.4), 1) - 0.6 * spread, 0)
         mixed = copy.deepcopy(model)
         with torch.no_grad():
-            for weight, start in zip(mixed.unet.parameters(), model.start.parameters(), strict=True):
+            for weight, start in zip(mixed.unet.parameters(), model.start.buffers(), strict=True):
                 weight.copy_((1 - fraction) * weight + fraction * start)
         expected = mixed.train()(frame.replace(color=color))[0].image
         torch.testing.assert_close(model(frame.replace(color=color))[0].image, expected, rtol=1e-10, atol=1e-12)
@@ -147,6 +147,27 @@ def test_the_weights_of_each_image_are_mixed_according_to_its_noise() -> None:
     together = model(both.replace(extra={name: torch.cat([each] * 2) for name, each in frame.extra.items()}))[0].image
     torch.testing.assert_close(together, torch.cat(parts), rtol=1e-10, atol=1e-12)
     assert not torch.allclose(model.train()(frame)[0].image, parts[0])
+
+
+def test_the_fraction_follows_from_the_noise() -> None:
+    model, draws = started(), torch.Generator().manual_seed(5)
+    flat = torch.full((1, 3, 160, 160), 0.5, dtype=torch.float64)
+    noise = torch.randn(1, 1, 160, 160, generator=draws, dtype=torch.float64)
+    # Pairs of pixels in rows and in columns that share their noise.
+    shared = (noise + noise.roll(1, -1)) / 2
+    shared = (shared + shared.roll(1, -2)) / 2
+    found = []
+    for image in (flat, 1 + 0.3 * noise, (3 * noise).exp(), 1 + 0.2 * shared):
+        frame = Frame(flat * image, albedo=flat, normal=flat)
+        level, spread = (float(each) for each in noise_of(frame.color, frame.albedo, frame.normal))
+        fraction = float(model.statistics(frame)["start_fraction"])
+        assert fraction == pytest.approx(min(max(1.1 - 2 * level, 0.4), 1) - 0.6 * spread, abs=1e-12)
+        found.append(fraction)
+    assert found[0] == 1
+    assert 0.9 < found[1] < 1
+    assert found[2] == 0.4
+    assert 0.3 < found[3] < 0.5
+    assert float(model.train().statistics(frame)["start_fraction"]) == 0
 
 
 def test_the_fraction_can_be_set() -> None:
@@ -160,6 +181,22 @@ def test_the_fraction_can_be_set() -> None:
     torch.testing.assert_close(start, model.train()(frame)[0].image, rtol=1e-10, atol=1e-12)
     assert not torch.allclose(own, start)
     assert refused(lambda: create_model("oidn_tuned", fraction=1.5)) == "fraction: expected in [0, 1], found 1.5"
+
+
+def test_a_graph_for_any_number_of_images_has_the_mean_of_their_fractions() -> None:
+    model = started().float()
+    step = Step(model, {"color", "albedo", "normal"})
+    program = traced(step).module()
+    shots = [frame_of(*SIZE, seed=seed) for seed in range(2)]
+    given = [{name: frame.buffer(name) for name in step.given} for frame in shots]
+    both = {name: torch.cat([each[name] for each in given]) for name in given[0]}
+    fractions = [float(model.statistics(frame)["start_fraction"]) for frame in shots]
+    with torch.no_grad():
+        for buffers, fraction in ((given[0], fractions[0]), (both, sum(fractions) / 2)):
+            image = program(buffers, {})[0]
+            model.fraction = fraction
+            torch.testing.assert_close(image, model(Frame(**buffers))[0].image, rtol=1e-4, atol=1e-5)
+            model.fraction = None
 
 
 def test_without_weights_before_the_training_nothing_is_mixed() -> None:
