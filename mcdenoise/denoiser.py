@@ -20,6 +20,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
+    FILTERED,
     Journal,
     Model,
     Output,
@@ -40,9 +41,14 @@ from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
-from mcdenoise.sampling import suitable_model
+from mcdenoise.noise import noise_of
+from mcdenoise.sampling import sampled_at_centres
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
+
+# Level of noise of frames with some four samples a pixel. On eight shots at pixel centres, whose noise was reduced step
+# by step, cascaded_v2 was better above 0.1 to 0.17 (on sponza always).
+_MANY_SAMPLES = 0.15
 
 
 @dataclass
@@ -381,6 +387,27 @@ class Denoiser:
         if self._frames is not None and self._count + 1 >= self._frames:
             return True
         return self._buffers is not None and not self.has_history(self._buffers)
+
+
+def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
+    """The name of the model that suits a frame, and the reason in words.
+
+    ``cascaded_v2`` was trained on features sampled at the pixel centres and one sample a pixel, and is best there.
+    Files of a renderer have features through a pixel filter, for which the others were trained.
+
+    Args:
+        frame: ``None`` for one that is known to have features through a filter.
+        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
+    """
+    centred = frame is not None and sampled_at_centres(frame)
+    if cascade:
+        return DEFAULT if centred else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
+    reason = "features may be noisy, or filtered over pixels"
+    if frame is not None and centred:
+        if float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
+            return DEFAULT, "features are sampled at the pixel centres, and there is much noise"
+        reason = "features are sampled at the pixel centres, but there is little noise"
+    return FILTERED, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
 
 
 def denoise(

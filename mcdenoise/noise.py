@@ -22,9 +22,9 @@ _FOURTH = sqrt(70 / 6)
 # Limits of the ratio of both differences. On shots of Mitsuba and Cycles, none of 104 with independent noise then has a
 # spread of more than 0.5, and 35 of 40 with Gaussian, Mitchell and tent filters have; a nearly clean one and
 # small ones with few even surfaces are missed.
-_RATIO = (0.95, 0.87)
+_RATIO = (0.96, 0.88)
 # Sum of differences that is added to both, so that few pixels tell nothing.
-_FEW = 20.0
+_FEW = 10.0
 # Smallest difference that is noise, and limits of the fraction of noisy pixels, below which differences are those of
 # the scene. Without a normal, which shows edges, differences of scenes are larger.
 _LEAST, _LEAST_ALONE, _COMMON = 0.005, 0.04, (0.7, 0.8)
@@ -53,10 +53,10 @@ def noise_of(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None 
     smaller if neighbours share it. Smooth shading has small fourth differences.
 
     With weights ``w = max(1 - g / 0.02, 0.01)``, where g is the largest change of a feature between neighbours, and
-    0 where both differences are 0, as in a black background, the level is ``sum(w wide) / sum(w)``. With ``S(x) = 20 +
-    sum(w x / (x + 0.1))`` the spread rises from 0 to 1 while ``S(near) / S(wide)`` falls from 0.95 to 0.87, times the
-    same for the fraction of pixels with ``wide`` above 0.005 (0.04 without a normal), which has to rise from 0.7 to
-    0.8: in clean images both differences are those of the scene.
+    0 where both differences are 0, as in a black background, the level is ``sum(w wide) / sum(w)``. With ``S(x) = 10 +
+    sum(w x / (x + 0.1))`` the spread rises from 0 to 1 while the larger ratio ``S(near) / S(wide)`` of rows and of
+    columns falls from 0.96 to 0.88, times the same for the fraction of pixels with ``wide`` above 0.005 (0.04 without
+    a normal), which has to rise from 0.7 to 0.8: in clean images both differences are those of the scene.
 
     Args:
         color: ``(B, 3, H, W)`` noisy radiance; invalid values count as 0.
@@ -68,11 +68,12 @@ def noise_of(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None 
     rows = [_valid(each[..., ::_EVERY, :].to(dtype)) for each in images]
     columns = [_valid(each[..., ::_EVERY].mT.to(dtype)) for each in images]
     known, least = albedo is not None, _LEAST_ALONE if normal is None else _LEAST
-    sums = _sums(*rows, known=known, least=least) + _sums(*columns, known=known, least=least)
-    count, level, noisy, near, wide = sums.split(1, 1)
+    both = [_sums(*each, known=known, least=least) for each in (rows, columns)]
+    count, level, noisy = (both[0] + both[1])[:, :3].split(1, 1)
     count = count.clamp_min(LEAST_SUM)
-    spread = _between((near + _FEW) / (wide + _FEW), *_RATIO) * _between(noisy / count, *_COMMON)
-    return Noise(level / count, spread)
+    # A film's filter spreads samples along both axes.
+    ratio = torch.maximum(*((near + _FEW) / (wide + _FEW) for near, wide in (each[:, 3:].split(1, 1) for each in both)))
+    return Noise(level / count, _between(ratio, *_RATIO) * _between(noisy / count, *_COMMON))
 
 
 def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None = None) -> bool:

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.denoiser import AskedPrecision, Denoiser
+from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT, describe_weights
-from mcdenoise.sampling import suitable_model
 
 # With very many threads torch crashes instead of raising an error.
 _MOST_THREADS = 1024

@@ -103,7 +103,7 @@ def test_the_level_of_independent_noise() -> None:
     # square of its relative deviation.
     expected = deviation * 6**0.5 * (2 / torch.pi) ** 0.5 / 6 * (1 + 8 * deviation**2 / 36)
     assert level.shape == spread.shape == (2, 1, 1, 1)
-    # Of 160,000 differences some 50,000 are independent; their deviation is 0.76 of their mean.
+    # There are 160,000 differences, some 50,000 of them independent; their deviation is 0.76 of their mean.
     assert level.flatten().tolist() == pytest.approx([expected] * 2, rel=5 * 0.76 / 50_000**0.5)
     assert spread.flatten().tolist() == [0, 0]
 

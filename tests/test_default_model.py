@@ -13,8 +13,9 @@ from torch import Tensor
 from mcdenoise import denoise
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
+from mcdenoise.denoiser import suitable_model
 from mcdenoise.frame import Frame
-from mcdenoise.sampling import sampled_at_centres, suitable_model
+from mcdenoise.sampling import sampled_at_centres
 from mcdenoise.shot import ShotSettings, default_model
 
 HEIGHT, WIDTH = 30, 40
@@ -66,7 +67,8 @@ def test_at_pixel_centres_the_noise_decides() -> None:
     assert suitable_model(frame)[0] == "cascaded_v2"
     assert suitable_model(clean) == (
         "oidn_tuned",
-        "there is little noise; oidn_temporal has a smaller error, but takes longer",
+        "features are sampled at the pixel centres, but there is little noise; "
+        "oidn_temporal usually has a smaller error, but takes longer",
     )
     # The settings of its history require a cascade.
     assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
@@ -84,7 +86,10 @@ def test_positions_that_are_nowhere_are_no_evidence() -> None:
 
 def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
-    assert default_model(sequence) == ("cascaded_v2", "features are sampled at the pixel centres")
+    assert default_model(sequence) == (
+        "cascaded_v2",
+        "features are sampled at the pixel centres, and there is much noise",
+    )
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
     # A damaged frame is reported when it is denoised, and does not change the choice.
@@ -116,7 +121,7 @@ def test_the_command_says_what_it_picked(
         assert stop.value.code in (0, None)
         return capsys.readouterr().out
 
-    assert "picked cascaded_v2: features are sampled at the pixel centres\n" in printed()
+    assert "picked cascaded_v2: features are sampled at the pixel centres, and there is much noise\n" in printed()
     assert "picked" not in printed("--model", "joint_bilateral")
 
 
