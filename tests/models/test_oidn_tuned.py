@@ -131,8 +131,8 @@ def started() -> TunedNetwork:
 
 def test_the_weights_of_each_image_are_mixed_according_to_its_noise() -> None:
     model, frame = started(), given(0.5)
-    noisy, torch_state = frame.color, torch.Generator().manual_seed(4)
-    clean = torch.full_like(noisy, 0.5) + 1e-3 * torch.rand(noisy.shape, generator=torch_state, dtype=noisy.dtype)
+    noisy, draws = frame.color, torch.Generator().manual_seed(4)
+    clean = torch.full_like(noisy, 0.5) + 1e-3 * torch.rand(noisy.shape, generator=draws, dtype=noisy.dtype)
     for color in (noisy, clean):
         level, spread = (float(each) for each in noise_of(color, frame.albedo, frame.normal))
         fraction = max(min(max(1.1 - 2 * level, 0.4), 1) - 0.6 * spread, 0)
