@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import reprlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
@@ -28,6 +29,7 @@ from mcdenoise.models import (
     computing_in,
     create_model,
     fastest_precision,
+    find_model,
     has_network,
     listening,
     quantize,
@@ -160,6 +162,7 @@ class Denoiser:
         self.keep_all, self.differentiable, self.alpha = keep_all, differentiable, alpha
         of_zoo = isinstance(model, str) and ":" not in model
         if isinstance(model, str):
+            _check_settings(model, settings)
             model = create_model(model, pretrained=weights is None, weights=weights, **settings)
         elif settings or weights is not None:
             raise InputError(
@@ -465,12 +468,40 @@ def denoise(
     if model is None:
         # Weights and settings are those of the default, and layers are filtered with its kernels.
         model = DEFAULT if settings or frame.layers else suitable_model(frame)[0]
+    _check_settings(model, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
     # Raises an error for invalid values, which a GPU reports late.
     denoiser._settle()
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
+
+
+def _check_settings(model: object, given: Iterable[str], *, also: Collection[str] = ()) -> None:
+    """Refuse an argument by its name if nothing takes it; its value, which may be a large array, is not shown.
+
+    Args:
+        model: see :class:`Denoiser`. The settings of a model by the user are checked when it is created.
+        given: names of arguments that should be settings of the model.
+        also: names of buffers and arguments that the caller takes, too.
+    """
+    settings: Sequence[str] = ()
+    if isinstance(model, str):
+        if ":" in model:
+            return
+        parameters = inspect.signature(find_model(model).construct).parameters
+        if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
+            return
+        settings = list(parameters)
+    arguments = inspect.signature(Denoiser).parameters.keys() - {"settings"}
+    places = [*(["a buffer"] if also else []), "an argument of Denoiser"]
+    places += [f"a setting of model '{model}' ({', '.join(settings)})"] if settings else []
+    for name in given:
+        if name not in settings and name not in arguments:
+            near = did_you_mean(name, {*also, *arguments, *settings})
+            raise InputError(
+                f"argument '{name}': expected {' or '.join(places)}, found none of this name{near and '; '}{near}"
+            )
 
 
 def _check_kind(name: str, value: object, kinds: tuple[type, ...], expected: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -36,6 +37,14 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """
     near = get_close_matches(name.lower(), known)
     return f"did you mean {' or '.join(near)}?" if near else ""
+
+
+def level_of_caller() -> int:
+    """The ``stacklevel`` with which a warning shows the line that called this package, instead of a line in it."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_globals.get("__name__", "").partition(".")[0] == __package__ and frame.f_back is not None:
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def is_unicode(text: str) -> bool:

@@ -54,6 +54,7 @@ class SequenceReport:
     Args:
         model: name of the model with its settings, or path of its weights.
         reading: how the sequence stores its color.
+        picked: the model that was picked, and why; empty if it was named.
         frames: report of each frame, by number; run times include waiting for the disk.
         files: the written file of each frame, by number.
         alike: frames that look like the previous one but have no history.
@@ -62,6 +63,7 @@ class SequenceReport:
 
     model: str
     reading: str
+    picked: str = ""
     frames: dict[int, FrameReport] = field(default_factory=dict)
     files: dict[int, Path] = field(default_factory=dict)
     alike: list[int] = field(default_factory=list)
@@ -127,6 +129,7 @@ def denoise_sequence(
     full_float: bool = False,
     output_layer: str | None = None,
     references: bool = False,
+    picked: str = "",
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
     on_written: Callable[[str, Tensor, Metadata], None] | None = None,
@@ -144,6 +147,7 @@ def denoise_sequence(
         full_float: write the radiance as 32-bit floats, whatever its type was before.
         output_layer: name of a layer to add; no layer is replaced then.
         references: also read references, for ``on_output``.
+        picked: see :class:`SequenceReport`.
         on_frame: called after each denoised frame.
         on_output: called with each frame and its output including stages, which need additional memory.
         on_written: called with the name of each written file without ``.exr``, its image ``(1, 3, H, W)`` and its
@@ -154,7 +158,7 @@ def denoise_sequence(
             cannot be written to, or memory is insufficient. Frames before the one that the message names are written.
     """
     prepare_folder(sequence, out)
-    report = new_report(sequence, model)
+    report = new_report(sequence, model, picked)
 
     write_frames(
         sequence,
@@ -173,15 +177,16 @@ def denoise_sequence(
     return report
 
 
-def new_report(sequence: Sequence, model: str) -> SequenceReport:
+def new_report(sequence: Sequence, model: str, picked: str = "") -> SequenceReport:
     """An empty report.
 
     Args:
         sequence: the frames.
         model: name of the model.
+        picked: see :class:`SequenceReport`.
     """
     stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
-    return SequenceReport(model, f"color is stored {stored}")
+    return SequenceReport(model, f"color is stored {stored}", picked)
 
 
 def write_frames(
@@ -465,6 +470,7 @@ def _of_earlier_runs(out: Path, written: Iterable[Path]) -> list[str]:
 def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:
     return {
         "model": report.model,
+        "picked": report.picked,
         "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
         "device": str(denoiser.device),
         "precision": denoiser.precision,

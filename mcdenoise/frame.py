@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, did_you_mean, level_of_caller
 from mcdenoise.ops._rows import by_rows
 
 # Half floats and a renderer's own arithmetic may exceed a range by this.
@@ -283,8 +283,11 @@ class Frame:
         if layout not in LAYOUTS:
             raise InputError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
         if unknown := set(buffers) - OF_RENDERERS:
-            known = ", ".join(sorted(OF_RENDERERS))
-            raise InputError(f"buffer '{min(unknown)}': expected one of {known}; others go into extra={{...}}")
+            known, near = sorted(OF_RENDERERS), did_you_mean(min(unknown), OF_RENDERERS)
+            raise InputError(
+                f"buffer '{min(unknown)}': expected one of {', '.join(known)}; others go into extra={{...}}"
+                f"{near and '; '}{near}"
+            )
         image = _of_array("color", color, layout, None)
         size = (image.shape[2], image.shape[3])
         given: dict[str, Any] = {
@@ -653,7 +656,7 @@ def _refuse_range(name: str, low: float, high: float, above: float) -> None:
         warnings.warn(
             f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, "
             f"which count as {spec.high:g}; leave the buffer out if it is another one",
-            stacklevel=2,
+            stacklevel=level_of_caller(),
         )
     if low < spec.low - _ROUNDING or (high > _limit(spec) and not forgiven):
         raise InputError(

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from math import sqrt
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._constants import LEAST_SUM
+from mcdenoise.ops._steps.noise import noise_sums
 
-_DARKEST, _BRIGHTEST = 0.02, 1e16  # smallest albedo to divide by, and largest radiance
-_EVERY = 8  # rows and columns are examined at this distance
-# Where a feature changes by this from pixel to pixel, differences may be those of the scene: their weight is the least.
-_EVEN, _UNEVEN = 0.02, 0.01
-# Smaller differences are rounding errors. Edges and fireflies should not outweigh the rest.
-_ROUNDED, _LARGE = 1e-6, 0.1
-# Fourth differences of independent noise of variance 1 have the variance 70, second differences 6.
-_FOURTH = sqrt(70 / 6)
 # Limits of the ratio of both differences. On shots of Mitsuba and Cycles, none of 104 with independent noise then has a
 # spread of more than 0.5, and 35 of 40 with Gaussian, Mitchell and tent filters have; a nearly clean one and
 # small ones with few even surfaces are missed.
@@ -63,17 +54,14 @@ def noise_of(color: Tensor, albedo: Tensor | None = None, normal: Tensor | None 
         albedo: ``(B, 3, H, W)``; ``None`` if there is none.
         normal: likewise, in any encoding.
     """
-    dtype = torch.promote_types(color.dtype, torch.float32)
-    images = [each.detach() for each in (color, albedo, normal) if each is not None]
-    rows = [_valid(each[..., ::_EVERY, :].to(dtype)) for each in images]
-    columns = [_valid(each[..., ::_EVERY].mT.to(dtype)) for each in images]
-    known, least = albedo is not None, _LEAST_ALONE if normal is None else _LEAST
-    both = [_sums(*each, known=known, least=least) for each in (rows, columns)]
-    count, level, noisy = (both[0] + both[1])[:, :3].split(1, 1)
-    count = count.clamp_min(LEAST_SUM)
+    least = _LEAST_ALONE if normal is None else _LEAST
+    with torch.no_grad():
+        weight, level, noisy, near, wide = noise_sums(color, albedo, normal, least).unbind(-1)
+    count = weight.sum(1).clamp_min(LEAST_SUM)
     # A film's filter spreads samples along both axes.
-    ratio = torch.maximum(*((near + _FEW) / (wide + _FEW) for near, wide in (each[:, 3:].split(1, 1) for each in both)))
-    return Noise(level / count, _between(ratio, *_RATIO) * _between(noisy / count, *_COMMON))
+    ratio = ((near + _FEW) / (wide + _FEW)).amax(1)
+    spread = _between(ratio, *_RATIO) * _between(noisy.sum(1) / count, *_COMMON)
+    return Noise((level.sum(1) / count).reshape(-1, 1, 1, 1), spread.reshape(-1, 1, 1, 1))
 
 
 def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None = None) -> bool:
@@ -82,37 +70,6 @@ def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None 
     The answer is read on the host. It is yes if any image of a batch has such noise, and no for nearly clean frames.
     """
     return bool(noise_of(color, albedo, normal).spread.amax() > 0.5)
-
-
-def _sums(color: Tensor, *features: Tensor, known: bool, least: float) -> Tensor:
-    """Sums ``(B, 5, 1, 1)`` over pixels.
-
-    These are the weights of the pixels, ``wide``, the weights of those where it is above ``least``, and both
-    differences as far as they count. ``known`` tells whether the first of the features is the albedo.
-    """
-    light = color.clamp_min(0)
-    if known:
-        light = light / features[0].clamp_min(_DARKEST)
-    a, b, c, d, e = _padded(light.mean(1, keepdim=True)).unfold(-1, 5, 1).unbind(-1)
-    mean = (a + b + 2 * c + d + e).clamp_min(LEAST_SUM)
-    near = (a - 4 * b + 6 * c - 4 * d + e).abs() / (_FOURTH * mean)
-    wide = (a - 2 * c + e).abs() / mean
-    weight = torch.ones_like(mean)
-    if features:
-        steps = _padded(torch.cat(features, 1)).diff(dim=-1).abs().amax(1, keepdim=True)
-        weight = (1 - steps.unfold(-1, 4, 1).amax(-1) / _EVEN).clamp_min(_UNEVEN)
-    weight = weight * (near + wide > _ROUNDED)
-    counted = (torch.ones_like(wide), wide, wide > least, *(each / (each + _LARGE) for each in (near, wide)))
-    return torch.cat([(weight * each).sum((1, 2, 3), keepdim=True) for each in counted], 1)
-
-
-def _valid(image: Tensor) -> Tensor:
-    return image.nan_to_num(0.0).clamp(-_BRIGHTEST, _BRIGHTEST)
-
-
-def _padded(rows: Tensor) -> Tensor:
-    """``(B, C, H, W)`` with two more pixels at both ends of each row."""
-    return F.pad(rows, (2, 2, 0, 0), mode="replicate")
 
 
 def _between(x: Tensor, start: float, end: float) -> Tensor:

@@ -536,14 +536,25 @@ def test_a_method_is_skipped_on_scenes_that_lack_its_buffers(
     assert Cell("plane", "svgf", failure="out of luck").reason == "failed: out of luck"
 
 
+def test_an_empty_folder_is_accepted(small_sequence: Path, out: Path, run: Callable[..., Any]) -> None:
+    out.mkdir()
+    status, _, _ = run(
+        *(small_sequence, "-o", out, "--models", "none", "--frames", "0-1", "--rounds", 1, "--sizes", "none")
+    )
+    assert status == 0
+    assert Results.read(out).cells
+    assert (out / "index.html").is_file()
+    assert not list(out.glob(".*"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        ((), "expected nothing there yet, found something"),
+        ((), "expected a new or an empty folder, found files in it; choose another folder, or remove what is there"),
         (("--models", "cascade"), "model 'cascade': found no model of this name; did you mean cascaded"),
         (("--models", "cascaded_v2,cascaded_v2"), "methods: expected different names"),
         (("--models", "cascaded_v2(width)"), "expected settings such as (setting=value), found 'width'"),
-        (("--models", "cascaded_v2(hue=3)"), "model 'cascaded_v2': expected no settings but alpha_min"),
+        (("--models", "cascaded_v2(hue=3)"), "argument 'hue': expected an argument of Denoiser or a setting of model"),
         (("--models", "nowhere.py:make"), "nowhere.py: expected a Python file with a factory of a model"),
         (("--precisions", "float8"), "--precisions: expected some of float32, bfloat16"),
         (("--device", "tpu"), "--device: expected cpu or cuda, found 'tpu'"),

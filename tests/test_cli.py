@@ -164,8 +164,13 @@ def test_unknown_command(refused: Callable[..., str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["denoise"], "PATH"),
-        (["denoise", "somewhere"], "--out"),
+        (["denoise"], ": expected --out PATH, found none; see"),
+        (
+            ["denoise", "somewhere", "--ot", "out"],
+            "expected --out PATH, found none; unrecognized options: --ot out; see",
+        ),
+        (["render"], ": expected SCENE, --camera-path PATH, --out PATH, found none; see"),
+        (["evaluate"], ": expected SEQUENCE, found none; see"),
         (["denoise", "somewhere", "-o", "out", "--colour"], "--colour"),
         (["denoise", "somewhere", "-o", "out", "--threads", "many"], "--threads"),
         (["denoise", "somewhere", "-o", "out", "--alpha-min", "small"], "--alpha-min"),
@@ -175,10 +180,20 @@ def test_unknown_command(refused: Callable[..., str]) -> None:
     ],
     ids=" ".join,
 )
-def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: str) -> None:
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+def test_bad_usage(
+    refused: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    expected: str,
+    encoding: str,
+) -> None:
+    # tyro draws lines for one encoding, and hyphens for another.
+    monkeypatch.setattr(type(sys.stdout), "encoding", encoding)
     message = refused(*arguments)
     assert expected in message
     assert f"mcdenoise {arguments[0]} --help" in message
+    assert message.count("--help") == 1
 
 
 # Bad input
@@ -200,7 +215,7 @@ def test_bad_usage(refused: Callable[..., str], arguments: list[str], expected: 
         (
             "--model",
             "cascaded_v2(hue=1)",
-            "expected no settings but alpha_min, anti_lag, tolerance, restore beside its weights",
+            "argument 'hue': expected an argument of Denoiser or a setting of model 'cascaded_v2' (width, ",
         ),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
     ],
@@ -649,8 +664,8 @@ def test_evaluate_rejects_images_that_cannot_be_compared(
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
     assert "expected references" in refused(*evaluate)
-    assert "a folder of images, or --model, and not both" in refused(*evaluate, "--model", "cascaded_v2")
-    assert "a folder of images, or --model, and not both" in refused(*evaluate[:2])
+    assert f"found both, {colors} and cascaded_v2; omit one" in refused(*evaluate, "--model", "cascaded_v2")
+    assert f"found only the sequence {small_sequence}; name the folder after it, or" in refused(*evaluate[:2])
     assert "no such folder" in refused("evaluate", small_sequence / "nowhere", colors)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,8 +123,19 @@ def test_the_command_says_what_it_picked(
         assert stop.value.code in (0, None)
         return capsys.readouterr().out
 
-    assert "picked cascaded_v2: features are sampled at the pixel centres, and there is much noise\n" in printed()
+    def report(folder: str) -> dict[str, Any]:
+        return json.loads((tmp_path / folder / "denoise.json").read_text())
+
+    picked = "cascaded_v2: features are sampled at the pixel centres, and there is much noise"
+    assert f"picked {picked}\n" in printed()
+    assert report("0")["picked"] == picked
     assert "picked" not in printed("--model", "joint_bilateral")
+    assert report("2")["picked"] == ""
+    # The model is also known before denoising.
+    with pytest.raises(SystemExit):
+        main(["inspect", str(small_sequence), "--json", str(tmp_path / "inspect.json")])
+    assert f"`mcdenoise denoise` picks {picked}\n" in capsys.readouterr().out
+    assert json.loads((tmp_path / "inspect.json").read_text())["picked"] == picked
 
 
 def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:

@@ -412,14 +412,19 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
     accumulated = next(parts_of(denoiser.model, Accumulated))
     assert (accumulated.alpha_min, accumulated.lag_threshold) == (0.3, float("inf"))
     for make in (
-        lambda: Denoiser("cascaded_v2", nonsense=1),
-        lambda: Denoiser("cascaded_v2", weights=weights, nonsense=1),
+        lambda: Denoiser("cascaded_v2", width=9),
+        lambda: Denoiser("cascaded_v2", weights=weights, width=9),
     ):
         message = refused(make)
         assert (
-            "but alpha_min, anti_lag, tolerance, restore beside its weights, found nonsense=1; the weights fix width"
+            "but alpha_min, anti_lag, tolerance, restore beside its weights, found width=9; the weights fix width"
             in message
         )
+    message = refused(lambda: Denoiser("oidn_tuned", fractoin=torch.zeros(9, 9)))
+    assert message == (
+        "argument 'fractoin': expected an argument of Denoiser or a setting of model 'oidn_tuned' (size, fraction, "
+        "restore), found none of this name; did you mean fraction?"
+    )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
     assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))

@@ -183,16 +183,45 @@ def test_buffers_that_do_not_fit_the_color_are_refused_in_one_line(name: str, va
 def test_names_and_layouts_that_are_none() -> None:
     with pytest.raises(InputError, match="layout: expected one of HWC, CHW, found 'NHWC'"):
         Frame.from_numpy(image(3), layout="NHWC")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"buffer 'normals': expected one of .* normal, .*; others go into extra"):
+    with pytest.raises(InputError, match=r"buffer 'normals': expected one of .*; others go .*; did you mean normal\?"):
         Frame.from_numpy(image(3), normals=image(3))
-    with pytest.raises(InputError, match="normals"):
-        denoise(image(3), normals=image(3), model=MODEL)
     with pytest.raises(
         InputError, match=r"extra: expected names that Frame does not know, found 'albedo'; pass albedo="
     ):
         Frame.from_numpy(image(3), extra={"albedo": image(3)})
     with pytest.raises(InputError, match=r"buffer 'crypto': expected shape \(5, 7, C\)"):
         Frame.from_numpy(image(3), extra={"crypto": image(2)[1:]})
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "near"),
+    [
+        ("normals", None, "normal"),
+        ("normals", "noisy", "normal"),
+        ("normals", lambda color: color, "normal"),
+        ("wieghts", None, "weights"),
+        ("layuot", None, "layout"),
+        ("alpha_mni", MODEL, "alpha_min or alpha"),
+    ],
+)
+def test_a_misspelt_argument_is_named_without_its_value(name: str, model: Any, near: str) -> None:
+    with pytest.raises(InputError) as caught:
+        denoise(image(3), model=model, **{name: image(3)})
+    assert complaint(caught).startswith(f"argument '{name}': expected a buffer or an argument of Denoiser")
+    assert complaint(caught).endswith(f", found none of this name; did you mean {near}?")
+    assert "0." not in complaint(caught)
+
+
+def test_a_warning_shows_the_line_of_the_caller() -> None:
+    albedo = image(3)
+    albedo[0, 0] = 3
+    for function in (
+        lambda: denoise(image(3), albedo=albedo, model="noisy"),
+        Frame.from_numpy(image(3), albedo=albedo).validate,
+    ):
+        with pytest.warns(UserWarning, match="buffer 'albedo': expected values up to 1") as caught:
+            function()
+        assert [each.filename for each in caught] == [__file__]
 
 
 # A still in one call

@@ -121,6 +121,17 @@ def _says(source: str, layer: str) -> bool:
     return bool(layer) and (layer in source and (layer.split(".")[-1].split(" ")[-1] in words or f"{layer}_" in source))
 
 
+def test_the_motion_of_blender_for_arrays() -> None:
+    assert "`vector[..., :2] * np.float32([1, -1])`" in SECTIONS["numpy"]
+    path = RENDERERS / "blender" / "shot_0002.exr"
+    vector = np.concatenate([channel(path, f"ViewLayer.Vector.{each}") for each in "XYZW"], -1)
+    motion = vector[..., :2] * np.float32([1, -1])
+    assert abs(motion[..., 1]).max() > 0.1
+    motion[channel(path, "ViewLayer.Depth.Z")[..., 0] == 1e10] = np.inf
+    read = open_sequence(RENDERERS / "blender").frame(2).motion
+    np.testing.assert_array_equal(read[0].permute(1, 2, 0).numpy(), motion)
+
+
 @pytest.mark.parametrize(
     ("section", "files"),
     [("Blender", "blender"), ("Mitsuba", "mitsuba"), ("pbrt", "pbrt")],

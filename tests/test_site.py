@@ -90,6 +90,8 @@ def test_links_that_leave_the_docs_stay_within_the_site(site) -> None:
     own = Path("docs/compose.md")
     assert within("../CONTRIBUTING.md", own, "compose.md") == "contributing.md"
     assert within("../examples/layers.py", own, "compose.md") == "examples/layers.md"
+    assert within("../mcdenoise/models", own, "compose.md") == "methods/index.md"
+    assert within("../mcdenoise/ops", own, "examples/layers.md") == "../operators/index.md"
     assert within("../docs/wild.md", Path("training/README.md"), "training.md") == "wild.md"
     assert within("https://kornia.org", own, "compose.md") == "https://kornia.org"
 

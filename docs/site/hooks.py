@@ -29,6 +29,8 @@ MOVED = {
     "training/README.md": "training.md",
     "benchmarks/README.md": "benchmarks.md",
 }
+# Folders of source files, with the generated pages about them.
+SOURCES = {"mcdenoise/models": "methods/index.md", "mcdenoise/ops": "operators/index.md"}
 
 
 def on_config(config: Any) -> Any:
@@ -86,8 +88,8 @@ def within_site(target: str, own: Path, page: str) -> str:
     for part in (own.parent / target).parts:
         parts = parts[:-1] if part == ".." and parts else [*parts, part]
     place = "/".join(parts)
-    if place in MOVED:
-        place = MOVED[place]
+    if (page_about := (MOVED | SOURCES).get(place)) is not None:
+        place = page_about
     elif place.startswith("docs/"):
         place = place.removeprefix("docs/")
     elif place.startswith("examples"):

@@ -121,7 +121,7 @@ def benchmark_ops(
         on_step: called with the number of ops done, and that of all of them.
 
     Raises:
-        InputError: a number is too small, the device cannot be used, or there is something at ``out``.
+        InputError: a number is too small, the device cannot be used, or ``out`` exists and is no empty folder.
     """
     width, height = size
     if min(size) < 2 or rounds < 1 or threads < 1:

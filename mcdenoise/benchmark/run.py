@@ -109,8 +109,8 @@ def run_benchmark(
     Args:
         sequences: frames with references.
         methods: see :func:`choose_methods`; missing methods are listed as such.
-        out: new folder for ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``. It appears once the
-            benchmark is complete.
+        out: new or empty folder for ``results.json``, ``results.csv`` and ``images/SCENE/METHOD/N.exr``, which appear
+            once the benchmark is complete.
         settings: settings of the measurement; this sets torch's number of threads.
         on_step: called with the number of finished steps and the number of all steps.
 
@@ -119,7 +119,7 @@ def run_benchmark(
         lacks a buffer, has a cell with the reason; a scene whose files cannot be read fails for all methods.
 
     Raises:
-        InputError: a sequence has no references, ``out`` exists, or it cannot be written to.
+        InputError: a sequence has no references, ``out`` exists and is no empty folder, or it cannot be written to.
     """
     settings = settings or Settings()
     for sequence in sequences:

@@ -8,6 +8,7 @@ import importlib
 import io
 import itertools
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import is_dataclass
@@ -172,10 +173,24 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
     except SystemExit as stop:
         if not stop.code:
             raise
-        # tyro prints a box with a title, the error, a rule, and more help.
-        lines = [line.strip("│╭╮╰╯ ") for line in messages.getvalue().splitlines()]
-        error = itertools.takewhile(lambda line: line.strip("─"), lines[1:])
-        raise InputError(f"{' '.join(error).rstrip('.')}; see `{prog} --help`") from stop
+        raise InputError(f"{_in_one_line(messages.getvalue())}; see `{prog} --help`") from stop
+
+
+def _in_one_line(box: str) -> str:
+    """The errors that tyro prints in a box, without the help that it adds to them."""
+    # The box has a title, and then blocks with rules between them; a terminal without Unicode gets rules of hyphens.
+    lines = [line.rstrip("│ ")[2:] for line in box.splitlines()[1:-1]]
+    blocks = [list(block) for inside, block in itertools.groupby(lines, lambda line: bool(line.strip("─-"))) if inside]
+    errors = []
+    for i, block in enumerate(blocks):
+        if block[0].startswith("Missing from"):
+            # A line with the names of an option is indented by four spaces, and its help by more.
+            missing = [line.rpartition(", ")[2].strip() for line in block if re.match(r" {4}\S", line)]
+            errors.append(f"expected {', '.join(missing)}, found none")
+        elif i == 0 or block[0].startswith("Unrecognized"):
+            text = " ".join(line.strip() for line in block).rstrip(".")
+            errors.append(text[0].lower() + text[1:])
+    return "; ".join(errors)
 
 
 def _expanded(argument: str) -> str:

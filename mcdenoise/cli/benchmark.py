@@ -50,9 +50,9 @@ def benchmark(
 ) -> int:
     """Measure the error and the run time of methods, which take turns on the same frames.
 
-    Writes the report OUT/index.html with its plots, results.json, results.csv and images; OUT must not exist. The exit
-    status is 1 if a method failed on a scene; a method is skipped on scenes that lack a buffer it needs. With --ops,
-    measures the operators instead: run time, error, and run time relative to a copy.
+    Writes the report OUT/index.html with its plots, results.json, results.csv and images; OUT must be new or empty. The
+    exit status is 1 if a method failed on a scene; a method is skipped on scenes that lack a buffer it needs. With
+    --ops, measures the operators instead: run time, error, and run time relative to a copy.
 
     With --suite wild, renders the missing frames of a test suite that no training uses, in Mitsuba and in Blender's
     Cycles, to the folder of --data, and compares --models with OIDN's best setting on each row: OUT/suite.md,
@@ -61,7 +61,7 @@ def benchmark(
 
     Args:
         sequences: folders of sequences with references.
-        out: new folder for the results; required except with --ops.
+        out: new or empty folder for the results; required except with --ops.
         models: methods separated by commas: names of `mcdenoise models`, with optional settings such as
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all models with shipped weights;
             "all" for every model, where those without weights are listed as missing; or "none". By default the models

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -16,7 +17,7 @@ from mcdenoise.models import calibrating, describe_weights, load_weights, save_w
 
 
 def calibrate(
-    weights: tyro.conf.Positional[Path],
+    weights: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="WEIGHTS")]],
     sequences: tyro.conf.Positional[tuple[Path, ...]],
     out: Out,
     frames: str | None = None,

@@ -83,6 +83,7 @@ def denoise(
             str(spelling.weights or spelling.name),
             full_float=shot.full_float,
             output_layer=shot.output_layer,
+            picked=choice,
             on_frame=lambda: progress.advance(task),
             on_written=shown.add if shown else None,
         )

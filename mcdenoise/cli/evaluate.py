@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 from rich.table import Table
@@ -17,7 +18,7 @@ from mcdenoise.metrics.protocols import ProtocolName
 
 
 def evaluate(
-    sequence: tyro.conf.Positional[Path],
+    sequence: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]],
     images: tyro.conf.Positional[Path | None] = None,
     model: str | None = None,
     protocol: ProtocolName = "strict",
@@ -38,8 +39,13 @@ def evaluate(
         device: device of the model: cpu or cuda.
         json: write the printed figures to this file too.
     """
-    if (images is None) is (model is None):
-        raise InputError("expected a folder of images, or --model, and not both; see `mcdenoise evaluate --help`")
+    if images is not None and model is not None:
+        raise InputError(f"expected a folder of images or --model, found both, {images} and {model}; omit one of them")
+    if images is None and model is None:
+        raise InputError(
+            f"expected a folder of images or --model, found only the sequence {sequence}; name the folder after it, or "
+            "add --model NAME to denoise and compare"
+        )
     opened = open_sequence(sequence, frames)
     spelling = None if model is None else parse_method(model)
     total = len(opened.reference_numbers if spelling is None else opened.numbers)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -16,7 +17,7 @@ from mcdenoise.models import create_model
 
 
 def export(
-    model: tyro.conf.Positional[str],
+    model: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="MODEL")]],
     out: Out,
     weights: Path | None = None,
     buffers: str | None = None,

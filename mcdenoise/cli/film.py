@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -16,7 +17,7 @@ from mcdenoise.film import Film, ShotResult, read_film, run_film, write_page
 
 
 def film(
-    manifest: tyro.conf.Positional[Path],
+    manifest: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILM")]],
     out: Out,
     shot: tyro.conf.OmitArgPrefixes[ShotOptions],
     workers: int | None = None,

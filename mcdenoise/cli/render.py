@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -66,7 +66,7 @@ class RenderOptions:
 
 
 def render(
-    scene: tyro.conf.Positional[Path],
+    scene: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SCENE")]],
     camera_path: Path,
     out: Out,
     rendering: tyro.conf.OmitArgPrefixes[RenderOptions],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -10,7 +11,7 @@ from mcdenoise.cli._output import say
 from mcdenoise.report import write_report
 
 
-def report(folder: tyro.conf.Positional[Path]) -> None:
+def report(folder: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FOLDER")]]) -> None:
     """Write FOLDER/index.html and FOLDER/plots/ from the results and pictures of a finished benchmark.
 
     Args:

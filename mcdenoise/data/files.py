@@ -115,20 +115,29 @@ def held(folder: Path, work: str) -> Iterator[None]:
 def new_folder(path: Path) -> Iterator[Path]:
     """Yield a temporary folder beside ``path``, and rename it to ``path`` if the block succeeds.
 
-    If the block fails or is interrupted, the temporary folder is removed with its contents.
+    If ``path`` is an empty folder, the temporary folder is in it, and its contents are moved to ``path``, which may be
+    a link, the working folder or another disk. If the block fails or is interrupted, the temporary folder is removed
+    with its contents.
 
     Args:
-        path: the folder to create; nothing may exist there.
+        path: the folder to create; nothing but an empty folder may exist there.
 
     Yields:
-        An empty folder in the same parent folder.
+        An empty folder.
 
     Raises:
-        InputError: ``path`` exists, or the operating system refuses to write.
+        InputError: ``path`` exists and is no empty folder, or the operating system refuses to write.
     """
-    if os.path.lexists(path):
-        raise InputError(f"{path}: expected nothing there yet, found something; choose a new folder, or remove it")
-    temporary = path.absolute().with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}")
+    exists = path.is_dir()
+    with _writing(path):
+        if exists:
+            _sweep(path)
+        if os.listdir(path) if exists else os.path.lexists(path):
+            raise InputError(
+                f"{path}: expected a new or an empty folder, found {'files in it' if exists else 'a file'}; choose "
+                "another folder, or remove what is there"
+            )
+    temporary = (path if exists else path.parent).absolute() / f"{_PREFIX}{secrets.token_hex(8)}{_MARK}"
     handle = -1
     try:
         with unfinished(temporary), _writing(path):
@@ -137,8 +146,12 @@ def new_folder(path: Path) -> Iterator[Path]:
             _lock(handle)
             _sweep(temporary.parent)
             yield temporary
-            # This fails if a non-empty folder has been created there in the meantime.
-            os.rename(temporary, path)
+            if exists:
+                for name in os.listdir(temporary):
+                    os.rename(temporary / name, path / name)
+            else:
+                # This fails if a non-empty folder has been created there in the meantime.
+                os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         with suppress(OSError):

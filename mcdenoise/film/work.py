@@ -260,7 +260,7 @@ def summarize(order: Order) -> Summary:
     opened = _opened(order)
     found = read_records(order.records)
     records = [found[n] for n in opened.sequence.numbers if n in found and order.has(found[n])]
-    report = new_report(opened.sequence, _name(opened.shot))
+    report = new_report(opened.sequence, _name(opened.shot), opened.choice)
     report.frames = {each.number: each.report for each in records}
     report.files = {each.number: order.result(each) for each in records}
     report.alike = [each.number for each in records if each.alike]

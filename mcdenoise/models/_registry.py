@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -118,9 +119,16 @@ def find_model(name: str) -> Entry:
         return _MODELS[name]
     if name in _installed():
         return _of_factory(name, _loaded_entry_point(name))
+    known = list_models()
+    if (match := re.fullmatch(r"([^()]+)\((.*)\)", name)) and (match[1] in known or ":" in match[1]):
+        # On the command line, texts have no quotes.
+        settings = re.sub(r"=\s*(?!(?:True|False|None)\b)([A-Za-z]\w*)", r'="\1"', match[2])
+        raise InputError(
+            f"model '{name}': expected a name without settings, found some in parentheses; in Python settings are "
+            f'keyword arguments: Denoiser("{match[1]}", {settings})'
+        )
     if ":" in name or name.endswith(".py"):
         return _of_factory(name, load_own(name, "model", "factory")[0])
-    known = list_models()
     if near := did_you_mean(name, known):
         raise InputError(f"model '{name}': found no model of this name; {near} `mcdenoise models` lists all models")
     raise InputError(

@@ -4,7 +4,8 @@ The library denoises every frame separately: single images are state of the art,
 be told whether albedo and normal have noise, which rarely holds for a whole image: they are exact on a wall, and noisy
 behind glass, in a blurred mirror and out of focus. This method runs the library for noisy features and for clean ones,
 which it denoises first. The mean of both images is about as good as the better one, without having to know which one
-that is. Then the previous result is blended in. No weights are learnt.
+that is. Then the previous result is blended in, and detail that the library has smoothed is given back. No weights are
+learnt.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.oidn import Quality
 from mcdenoise.models.recurrent import Recurrent
+from mcdenoise.models.restored import Restored
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, Engine, WithOidn
@@ -66,6 +68,7 @@ def oidn_temporal(
     threads: int | None = None,
     engine: Engine = "auto",
     history: float = 4.0,
+    restore: bool = True,
 ) -> Model:
     """Open Image Denoise (optional package pyoidn) for noisy and for clean features, stabilized by the previous result.
 
@@ -76,6 +79,7 @@ def oidn_temporal(
         threads: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         engine: see :class:`mcdenoise.models.with_oidn.WithOidn`.
         history: see :class:`mcdenoise.models.steadied.Steadied`.
+        restore: whether :class:`mcdenoise.models.Restored` gives back detail.
 
     Raises:
         InputError: ``auxiliary`` is neither; otherwise see both classes.
@@ -85,4 +89,5 @@ def oidn_temporal(
     both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     chain = Chain(mixed=Mixed(_CLEAN_PART if both else 0.0), steadied=steadied)
-    return WithOidn(chain, quality=quality, prefilter=prefilter, threads=threads, engine=engine, clean=both)
+    model = WithOidn(chain, quality=quality, prefilter=prefilter, threads=threads, engine=engine, clean=both)
+    return Restored(model) if restore else model

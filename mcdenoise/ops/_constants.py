@@ -74,3 +74,12 @@ DEVIATIONS, GAIN, LEAST_MEAN = 3.0, 4.0, 0.1
 # Smallest mean and largest relative difference, so that all derivatives are finite; and smallest variance and power.
 DARKEST, MOST = 1e-15, 1e4
 LEAST_VARIANCE, LEAST_POWER = 1e-30, 1e-12
+
+# The noise of an image is told from the pixels of rows and columns at the distance EVERY. Smallest albedo to divide by,
+# and largest radiance. Where a feature changes by EVEN_FEATURE from pixel to pixel, differences may be those of the
+# scene: their weight is UNEVEN. Smaller differences than ROUNDED are rounding errors; edges and fireflies, which are
+# larger than LARGE_DIFFERENCE, should not outweigh the rest. Fourth differences of independent noise of variance 1 have
+# the variance 70, second differences 6.
+EVERY, DARKEST_ALBEDO, BRIGHTEST = 8, 0.02, 1e16
+EVEN_FEATURE, UNEVEN, ROUNDED, LARGE_DIFFERENCE = 0.02, 0.01, 1e-6, 0.1
+FOURTH = math.sqrt(70 / 6)

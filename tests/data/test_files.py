@@ -91,6 +91,25 @@ def test_two_that_write_the_same_do_not_meet(tmp_path: Path) -> None:
         assert one != other
 
 
+def test_a_new_folder_may_be_an_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to("empty")
+    monkeypatch.chdir(tmp_path / "empty")
+    with pytest.raises(InputError, match="cannot be written"), new_folder(Path()) as folder:
+        (folder / "half" / "of it").touch()
+    assert os.listdir() == []
+    with new_folder(tmp_path / "link") as folder:
+        (folder / "images").mkdir()
+        (folder / "images" / "one").touch()
+        assert [path.name for path in tmp_path.glob("*/images")] == []
+    # The folder is still the working folder, and the link still a link.
+    assert [path.as_posix() for path in Path().rglob("*")] == ["images", "images/one"]
+    assert (tmp_path / "link").is_symlink()
+    for path, found in ((tmp_path / "link", "files in it"), (tmp_path / "link" / "images" / "one", "a file")):
+        with pytest.raises(InputError, match=f"a new or an empty folder, found {found}"), new_folder(path):
+            pass
+
+
 @pytest.mark.parametrize("suffix", ["", ".txt", "." + "x" * 100])
 def test_long_names(tmp_path: Path, suffix: str) -> None:
     name = "n" * (255 - len(suffix)) + suffix

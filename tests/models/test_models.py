@@ -513,6 +513,19 @@ def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
     assert message == "alpha_min: expected in (0, 1], found 2.0"
 
 
+def test_settings_in_a_name_are_refused_with_the_call_that_has_them() -> None:
+    for name, call in (
+        ("oidn_tuned(fraction=0.4)", 'Denoiser("oidn_tuned", fraction=0.4)'),
+        ("oidn(quality=fast, clean=False)", 'Denoiser("oidn", quality="fast", clean=False)'),
+        ("mine.py:make(radius=2)", 'Denoiser("mine.py:make", radius=2)'),
+    ):
+        message = refused(lambda name=name: create_model(name))
+        assert message == (
+            f"model '{name}': expected a name without settings, found some in parentheses; in Python settings are "
+            f"keyword arguments: {call}"
+        )
+
+
 def test_files_that_are_no_weights_are_refused(weights: Path, tmp_path: Path) -> None:
     whole = weights.read_bytes()
     for content in (b"", b"a text, and no tensors", whole[:-100], whole[:100]):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mcdenoise.ops import downsample
 from mcdenoise.ops._numba import _runtime
-from mcdenoise.ops._steps import network, residual, transfer, tuned
+from mcdenoise.ops._steps import network, noise, residual, transfer, tuned
 
 # The tolerance is relative to the largest number in a result: a few roundings of sums of up to 54 products.
 TOLERANCE = {dtype: 32 * torch.finfo(dtype).eps for dtype in (torch.float32, torch.float64)}
@@ -91,6 +91,9 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
         # Part of the noise is correlated, so that weights are neither all 0 nor all 1.
         (residual.weight_of_noisy, [layout(radiance * (1.2 + 0.3 * draw(17, *radiance.shape, dtype))), radiance], {}),
         (residual.weight_of_noisy, [some(18, 3) * torch.inf, radiance], {}),
+        # Albedo and normal that are even in some pixels, and noise above and below the limit.
+        (noise.noise_sums, [radiance, 0.5 + 0.02 * some(24, 3), 0.01 * some(25, 3), 0.3], {}),
+        (noise.noise_sums, [some(18, 3) / (some(26, 3) > 0), None, None, 0.04], {}),
         (tuned.tuned_input, [radiance, *previous, *seen, valid, exposure, 4], {}),
         (tuned.tuned_input, [radiance, *previous, None, None, valid, exposure, 1], {}),
         (tuned.tuned_choice, [predicted, on_scale, valid, exposure, (0.0, -2.0, -1.0, 0.5)], {}),

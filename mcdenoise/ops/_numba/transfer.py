@@ -79,8 +79,10 @@ def compress_values(row: Any) -> None:
     for x in range(row.size):
         # Where a comparison with a NaN is false, `min` and `max` return their first argument, the NaN.
         light = min(max(row[x], zero), most)
-        power = number(_B) * exp(number(_C) * log(max(light, number(_Y0)))) + number(_D)
-        bright = number(_E) * log(light + number(_F)) + number(_G)
+        # One logarithm for both.
+        logarithm = log(max(light, number(_Y0)) if light <= number(_Y1) else light + number(_F))
+        power = number(_B) * exp(number(_C) * logarithm) + number(_D)
+        bright = number(_E) * logarithm + number(_G)
         found = number(PU_DARK) * light if light <= number(_Y0) else power if light <= number(_Y1) else bright
         row[x] = found / number(PU_WHITE)
 
