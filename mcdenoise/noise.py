@@ -11,9 +11,11 @@ from mcdenoise.ops._constants import LEAST_SUM
 from mcdenoise.ops._steps.noise import noise_sums
 
 # Limits of the ratio of both differences. On shots of Mitsuba and Cycles, none of 104 with independent noise then has a
-# spread of more than 0.5, and 35 of 40 with Gaussian, Mitchell and tent filters have; a nearly clean one and
-# small ones with few even surfaces are missed.
+# spread of more than 0.3, and 37 of 40 with Gaussian, Mitchell and tent filters have; three small ones with few even
+# surfaces are missed.
 _RATIO = (0.96, 0.88)
+# Spread from which neighbours count as sharing their noise. To miss that does more harm than to assume it.
+_SHARED = 0.35
 # Sum of differences that is added to both, so that few pixels tell nothing.
 _FEW = 10.0
 # Smallest difference that is noise, and limits of the fraction of noisy pixels, below which differences are those of
@@ -69,7 +71,7 @@ def noise_is_spread(color: Tensor, albedo: Tensor | None, normal: Tensor | None 
 
     The answer is read on the host. It is yes if any image of a batch has such noise, and no for nearly clean frames.
     """
-    return bool(noise_of(color, albedo, normal).spread.amax() > 0.5)
+    return bool(noise_of(color, albedo, normal).spread.amax() > _SHARED)
 
 
 def _between(x: Tensor, start: float, end: float) -> Tensor:

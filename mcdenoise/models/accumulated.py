@@ -21,7 +21,7 @@ from mcdenoise.models._spilled import spilled
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._windows import blend_in_windows, first_in_file
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface, clamp_fireflies, motion_from_position
+from mcdenoise.ops import Surface, motion_from_position
 from mcdenoise.ops._steps.history import (
     COLOR,
     MEAN,
@@ -494,17 +494,14 @@ def light_of_fireflies(color: Tensor) -> Tensor:
     height = color.shape[-2]
     step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
     # A graph for images of any size has no strips.
-    strips = (
-        [color]
-        if torch.compiler.is_compiling()
-        else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
-    )
+    whole = step == _BLOCK or torch.compiler.is_compiling()
+    strips = [color] if whole else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
     fractions = []
     for strip in strips:
         light = strip.to(torch.promote_types(color.dtype, torch.float32))
         before, after = (
             F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
-            for image in (light, clamp_fireflies(light))
+            for image in (light, incoming(light, compared=False))
         )
         # Not a number where there is no light to lose.
         fractions.append((1 - after / before).flatten(1))

@@ -6,8 +6,8 @@ the previous result, reprojected, and predict for every pixel which of four imag
 previous result in both forms of :class:`mcdenoise.models.Recurrent`; and the noisy pixels, which are right where there
 is no noise. Training on two renderers, with noisy and with exact features and 1 to 64 samples, replaces the settings.
 Since the library's own weights are better for little independent noise, the network of a frame has weights between
-these and the trained ones, according to its noise. :class:`mcdenoise.models.Restored` around it gives back the detail
-of nearly clean frames.
+these and the trained ones, according to its noise. :class:`mcdenoise.models.Clamped` around it removes fireflies, and
+:class:`mcdenoise.models.Restored` gives back the detail of nearly clean frames.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered
 from mcdenoise.models._registry import register_model
+from mcdenoise.models.clamped import Clamped
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.tiled import Tiled
@@ -161,7 +162,7 @@ def _tuned(size: Size = "base", *, fraction: float | None = None, restore: bool 
     Raises:
         InputError: ``fraction`` is outside [0, 1].
     """
-    model = Recurrent(Tiled(TunedNetwork(size, fraction)))
+    model = Clamped(Recurrent(Tiled(TunedNetwork(size, fraction))))
     return Restored(model) if restore else model
 
 

@@ -8,8 +8,7 @@ pixels. Every second pixel of every second row shares hardly any. So such a fram
 size, as in Zhou et al. 2020, "When AWGN-based Denoiser Meets Real Noises", AAAI (pixel-shuffle down-sampling). Put
 together they differ by a pattern of two by two pixels, which a small bilateral filter removes.
 
-It spreads a firefly, a single pixel that is far brighter than all others around it, over a spot. So fireflies are
-clamped first, as :class:`mcdenoise.models.Accumulated` does.
+Fireflies are clamped first, see :mod:`mcdenoise.models.clamped`.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import CAUSTICS, light_of_fireflies
+from mcdenoise.models.clamped import without_fireflies
 from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.noise import noise_is_spread
-from mcdenoise.ops import clamp_fireflies, cross_bilateral_filter, demodulate, remodulate
+from mcdenoise.ops import cross_bilateral_filter
 
 Engine = Literal["auto", "library", "torch"]
 # Keys in ``frame.extra``: OIDN's images for the features as they are and for clean ones, the clean albedo, and the
@@ -45,9 +44,6 @@ _LEAST_SLOPE, _EVEN = 4e-3, 0.1
 # Smallest difference of dissimilar normals, and largest fraction of dissimilar pixels. Fractions of up to 0.0039 were
 # measured in scenes without rough glass and metal, and 0.0069 in Cycles with them.
 _UNLIKE, _MOST_SPECKS = 0.1, 0.0045
-# Fraction of the light up to which bright pixels are fireflies, and from which they are caustics, and the limit of
-# fireflies. With one sample a pixel a limit of 15 has a smaller SMAPE in most scenes, but a lower PSNR.
-_RARE, _COMMON, _LIMIT = 0.05, 0.15, 30.0
 # The binomial kernel is zero at the frequencies of every pattern of two by two pixels. Falloff of its weights for the
 # squared difference of logarithms, and darkest color that matters, relative to the mean (on 15 stills of the training
 # data falloffs of 10 to 300 differ by 0.0008 in SMAPE).
@@ -62,8 +58,8 @@ class WithOidn(Wrapper):
     features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred`` ``(B, 1, H, W)``, 1 or 0,
     see :func:`has_centred_features`. Both images are also stages of the output. OIDN always takes the whole image, or,
     if its noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size. Fireflies are
-    clamped for it (:func:`mcdenoise.ops.clamp_fireflies`, with a limit that rises from 30 to 120 with the fraction of
-    the light that they have), so that the images lack a little light in return for fewer bright spots.
+    clamped for it (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a little light in
+    return for fewer bright spots.
 
     Features of rays through the pixels' centres have no noise (:func:`has_centred_features` and not
     :func:`has_scattered_features`). Whether they are right depends on the radiance: a renderer may place all samples
@@ -134,7 +130,7 @@ class WithOidn(Wrapper):
         oidn = self._faster()
         centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo, frame.normal)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
-        given = _without_fireflies(given.map(_phases) if spread else given)
+        given = without_fireflies(given.map(_phases) if spread else given)
         exact = centred and frame.normal is not None and not has_scattered_features(frame.normal)
         images = {OIDN: (noisy := oidn.denoised(given, "noisy"))}
         clean = [given] if exact else []
@@ -167,17 +163,6 @@ class WithOidn(Wrapper):
         made = OpenFilters(self.quality, prefilter=self.prefilter if self.clean else None)
         # As a denoiser prepares the networks that are there when it is made.
         return made.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload,no-any-return]
-
-
-def _without_fireflies(frame: Frame) -> Frame:
-    """The frame with clamped fireflies; the more of the light is in them, the more likely they are caustics."""
-    light = frame.color if frame.albedo is None else demodulate(frame.color, frame.albedo)
-    common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
-    limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
-    clamped = clamp_fireflies(light, limit=limit)
-    kept = clamped if frame.albedo is None else remodulate(clamped, frame.albedo)
-    # All other pixels remain as they are, without rounding errors.
-    return frame.replace(color=torch.where(clamped == light, frame.color, kept))
 
 
 def _phases(image: Tensor) -> Tensor:

@@ -32,7 +32,6 @@ from mcdenoise.models.with_oidn import (
     WithOidn,
     _merged,
     _phases,
-    _without_fireflies,
     _without_pattern,
     has_centred_features,
     has_scattered_features,
@@ -99,22 +98,6 @@ def test_fireflies_are_clamped_for_oidn() -> None:
     expected = Oidn("high", threads=1).denoised(frame.replace(color=clamped), "noisy")
     torch.testing.assert_close(extra[OIDN], expected)
     assert torch.equal(extra[NOISY], bright.color)
-
-
-def test_the_more_light_fireflies_have_the_less_they_are_clamped() -> None:
-    highest = {}
-    # One firefly in every fourth block of 32x32 pixels, in every block, and 16 in every block.
-    for apart in (64, 32, 8):
-        color = torch.ones(1, 3, 192, 256)
-        color[..., 4::apart, 4::apart] = 100
-        clamped = _without_fireflies(Frame(color)).color
-        highest[apart] = float(clamped.max())
-        assert torch.equal(clamped[color == 1], color[color == 1])
-    assert highest[64] == pytest.approx(30)
-    # The limit rises fourfold where they have 5 to 15 % of the light.
-    light = 85 / (1023 + 100)
-    assert highest[32] == pytest.approx(30 * 4 ** ((light - 0.05) / 0.1), rel=1e-4)
-    assert highest[8] == 100
 
 
 def test_noise_that_neighbours_share_is_removed() -> None:

@@ -16,6 +16,7 @@ from mcdenoise.frame import Frame, Hints, Skip
 from mcdenoise.models import (
     Accumulated,
     Chain,
+    Clamped,
     CoarseToFine,
     Demodulated,
     Exposed,
@@ -55,6 +56,7 @@ WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "demodulated": Demodulated,
     "exposed": Exposed,
     "accumulated": Accumulated,
+    "clamped": Clamped,
     "restored": Restored,
     "skipping": Skipping,
     "tiled": Tiled,
