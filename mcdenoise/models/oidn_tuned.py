@@ -151,18 +151,20 @@ _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 )
 
 
-def _tuned(size: Size = "base", *, fraction: float | None = None, restore: bool = True) -> Model:
+def _tuned(size: Size = "base", *, fraction: float | None = None, clamp: bool = True, restore: bool = True) -> Model:
     """The network with its memory.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
         fraction: see :class:`TunedNetwork`.
+        clamp: whether :class:`mcdenoise.models.Clamped` clamps fireflies.
         restore: whether :class:`mcdenoise.models.Restored` gives back detail.
 
     Raises:
         InputError: ``fraction`` is outside [0, 1].
     """
-    model = Clamped(Recurrent(Tiled(TunedNetwork(size, fraction))))
+    model: Model = Recurrent(Tiled(TunedNetwork(size, fraction)))
+    model = Clamped(model) if clamp else model
     return Restored(model) if restore else model
 
 
