@@ -47,6 +47,14 @@ def test_passes_go_to_the_smaller_half() -> None:
     assert paths == [(20, 16), (20, 32), (36, 32), (36, 48)]
 
 
+def test_the_noise_of_negative_radiance_is_positive() -> None:
+    halves = ReferenceHalves.start(np.zeros((2, 3)), 0, 0)
+    for value in (-0.02, -0.04):
+        halves.add(np.full((2, 3), value), 16)
+    # Half the difference, over 0.01 alone.
+    assert halves.noise() == pytest.approx(0.5 * 0.02 / 0.01)
+
+
 def test_one_half_alone_tells_nothing() -> None:
     halves = ReferenceHalves.start(np.ones((1, 3)), 20, 20)
     assert halves.noise() is None
