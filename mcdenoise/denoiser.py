@@ -44,7 +44,7 @@ from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.noise import noise_of
-from mcdenoise.sampling import sampled_at_centres
+from mcdenoise.sampling import has_exact_features
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
@@ -402,7 +402,7 @@ def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, 
         frame: ``None`` for one that is known to have features through a filter.
         cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
     """
-    centred = frame is not None and sampled_at_centres(frame)
+    exact = frame is not None and has_exact_features(frame)
     if cascade:
         return DEFAULT if centred else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
     reason = "features may be noisy, or filtered over pixels"

@@ -1,4 +1,4 @@
-"""The default model: features sampled at the pixel centres are told from features through a filter."""
+"""The default model, by the features and the noise of a frame."""
 
 from __future__ import annotations
 
@@ -17,54 +17,20 @@ from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import suitable_model
 from mcdenoise.frame import Frame
-from mcdenoise.sampling import sampled_at_centres
 from mcdenoise.shot import ShotSettings, default_model
 
 HEIGHT, WIDTH = 30, 40
-# Clip coordinates are (x, y, ., z): a pinhole camera that looks along z, with a right angle between the borders.
-CAMERA = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]])[None]
 
 
-def floor_seen_at(offset: Tensor) -> Frame:
-    """A tilted plane ``z = 3 + x``, seen through points of the pixels, ``offset`` from their centres in pixels."""
-    rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
-    x, y = (2 * (columns + offset[:, 0]) / WIDTH - 1), (2 * (rows + offset[:, 1]) / HEIGHT - 1)
-    depth = 3 / (1 - x)
+def exact() -> Frame:
+    """A plane seen through the pixel centres, as noisy as with one sample a pixel."""
+    columns = torch.arange(float(WIDTH)).expand(1, 1, HEIGHT, WIDTH)
     normal = torch.tensor([2**-0.5, 0, -(2**-0.5)]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-    return Frame(
-        torch.rand(1, 3, HEIGHT, WIDTH) ** 4,  # as noisy as with some four samples a pixel
-        normal=normal,
-        depth=depth[:, None],
-        position=torch.stack([x * depth, y * depth, depth], 1),
-        view_projection=CAMERA,
-    )
-
-
-@pytest.mark.parametrize("samples", [1, 16, 256])
-def test_a_filter_is_recognised_at_any_number_of_samples(samples: int) -> None:
-    jitter = (torch.rand(samples, 2, HEIGHT, WIDTH) - 0.5).mean(0, keepdim=True)
-    assert sampled_at_centres(floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH)))
-    assert not sampled_at_centres(floor_seen_at(jitter))
-
-
-def test_half_floats_do_not_count_as_a_filter() -> None:
-    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
-    stored = {name: getattr(frame, name).half().float() for name in ("position", "normal", "depth")}
-    assert sampled_at_centres(frame.replace(**stored))
-
-
-def test_normals_of_more_than_one_point_count_as_a_filter() -> None:
-    """Blender's positions are those of the first sample, but its normals are means."""
-    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
-    mixed = frame.normal.clone()
-    mixed[..., ::10] = (mixed[..., ::10] + torch.tensor([0, 1.0, 0]).reshape(1, 3, 1, 1)) / 2
-    background = frame.normal * (torch.arange(WIDTH) > 9)
-    assert sampled_at_centres(frame.replace(normal=background))
-    assert not sampled_at_centres(frame.replace(normal=mixed))
+    return Frame(torch.rand(1, 3, HEIGHT, WIDTH) ** 4, normal=normal, depth=3 / (1 - columns / (2 * WIDTH)))
 
 
 def test_at_pixel_centres_the_noise_decides() -> None:
-    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    frame = exact()
     clean = frame.replace(color=torch.full_like(frame.color, 0.5))
     assert suitable_model(frame)[0] == "cascaded_v2"
     assert suitable_model(clean) == (
@@ -74,16 +40,6 @@ def test_at_pixel_centres_the_noise_decides() -> None:
     )
     # The settings of its history require a cascade.
     assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
-
-
-@pytest.mark.parametrize("missing", ["position", "view_projection", "normal"])
-def test_without_positions_camera_or_normal_the_answer_is_no(missing: str) -> None:
-    assert not sampled_at_centres(floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH)).replace(**{missing: None}))
-
-
-def test_positions_that_are_nowhere_are_no_evidence() -> None:
-    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
-    assert not sampled_at_centres(frame.replace(position=torch.full_like(frame.position, torch.inf)))
 
 
 def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
@@ -139,7 +95,7 @@ def test_the_command_says_what_it_picked(
 
 
 def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
-    frame = floor_seen_at(torch.zeros(1, 2, HEIGHT, WIDTH))
+    frame = exact()
     arrays = {name: getattr(frame, name)[0].numpy() for name in ("normal", "depth", "position")}
     color, camera = frame.color[0].numpy(), {"view_projection": CAMERA[0].numpy()}
     for more, model in ((camera, "cascaded_v2"), ({}, "oidn_tuned")):

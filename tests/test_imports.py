@@ -47,7 +47,7 @@ ALLOWED: dict[str, set[str]] = {
     "ops": set(),
     "frame": {"errors", "ops"},
     "noise": {"ops"},
-    "sampling": {"frame", "ops"},
+    "sampling": {"frame"},
     "metrics": SIGNAL,
     "nn": SIGNAL,
     "models": SIGNAL | {"nn", "own", "user_cache"},

@@ -52,10 +52,14 @@ class ModelOverview:
     reason: str = ""
 
 
-def overview() -> list[ModelOverview]:
-    """One entry per registered model, sorted by kind and name; a model that cannot be made states the reason."""
+def overview(pattern: str = "*") -> list[ModelOverview]:
+    """One entry per registered model, sorted by kind and name; a model that cannot be made states the reason.
+
+    Args:
+        pattern: see :func:`list_models`.
+    """
     weights = dict.fromkeys(compared_models(), "compared") | dict.fromkeys(pretrained_models(), "shipped")
-    entries = [_overview(name, weights.get(name, "")) for name in list_models()]
+    entries = [_overview(name, weights.get(name, "")) for name in list_models(pattern)]
     return sorted(entries, key=lambda entry: get_args(Kind).index(entry.kind))
 
 

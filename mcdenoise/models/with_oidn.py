@@ -30,20 +30,13 @@ from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import cross_bilateral_filter
+from mcdenoise.sampling import has_centred_features, has_scattered_features
 
 Engine = Literal["auto", "library", "torch"]
 # Keys in ``frame.extra``: OIDN's images for the features as they are and for clean ones, the clean albedo, and the
 # frame's radiance.
 OIDN, OIDN_CLEAN, OIDN_ALBEDO, NOISY = "oidn", "oidn_clean", "oidn_albedo", "noisy"
 CENTRED = "centred"  # 1 in every pixel if the features come from rays through the pixels' centres, else 0
-# Smallest squared length of a normal that is not a mean of several, and largest fraction of pixels with shorter ones.
-_UNIT, _MOST_MEANS = 0.98, 0.002
-# Smallest relative difference of inverse depths two pixels apart that is no rounding error of half floats, and largest
-# relative change of the slope in smooth depth.
-_LEAST_SLOPE, _EVEN = 4e-3, 0.1
-# Smallest difference of dissimilar normals, and largest fraction of dissimilar pixels. Fractions of up to 0.0039 were
-# measured in scenes without rough glass and metal, and 0.0069 in Cycles with them.
-_UNLIKE, _MOST_SPECKS = 0.1, 0.0045
 # The binomial kernel is zero at the frequencies of every pattern of two by two pixels. Falloff of its weights for the
 # squared difference of logarithms, and darkest color that matters, relative to the mean (on 15 stills of the training
 # data falloffs of 10 to 300 differ by 0.0008 in SMAPE).
@@ -56,15 +49,15 @@ class WithOidn(Wrapper):
     The method finds them in ``frame.extra``, ``(B, 3, H, W)`` each: ``oidn`` for features treated as noisy;
     ``oidn_clean`` for features treated as clean, which OIDN denoises first; ``oidn_albedo``, the albedo of these
     features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred`` ``(B, 1, H, W)``, 1 or 0,
-    see :func:`has_centred_features`. Both images are also stages of the output. OIDN always takes the whole image, or,
-    if its noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size. Fireflies are
-    clamped for it (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a little light in
-    return for fewer bright spots.
+    see :func:`mcdenoise.sampling.has_centred_features`. Both images are also stages of the output. OIDN always takes
+    the whole image, or, if its noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the
+    size. Fireflies are clamped for it (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a
+    little light in return for fewer bright spots.
 
-    Features of rays through the pixels' centres have no noise (:func:`has_centred_features` and not
-    :func:`has_scattered_features`). Whether they are right depends on the radiance: a renderer may place all samples
-    there, or only the first, as Cycles does, whose converged image is anti-aliased. So ``oidn_clean`` is then the mean
-    of the images for these features and for denoised ones, and ``oidn_albedo`` is the frame's.
+    Features of rays through the pixels' centres have no noise unless rays were scattered
+    (:func:`mcdenoise.sampling.has_exact_features`). Whether they are right depends on the radiance: a renderer may
+    place all samples there, or only the first, as Cycles does, whose converged image is anti-aliased. So ``oidn_clean``
+    is then the mean of the images for these features and for denoised ones, and ``oidn_albedo`` is the frame's.
 
     Args:
         inner: any method.
@@ -131,7 +124,7 @@ class WithOidn(Wrapper):
         centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo, frame.normal)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
         given = without_fireflies(given.map(_phases) if spread else given)
-        exact = centred and frame.normal is not None and not has_scattered_features(frame.normal)
+        exact = centred and not has_scattered_features(frame)
         images = {OIDN: (noisy := oidn.denoised(given, "noisy"))}
         clean = [given] if exact else []
         if self.clean:
@@ -190,45 +183,3 @@ def _without_pattern(image: Tensor) -> Tensor:
     guide = (blurred + _DARKEST * blurred.mean(dim=(1, 2, 3), keepdim=True) + 1e-9).log()
     logits = (kernel.mT * kernel).log().reshape(1, 9, 1, 1).expand(len(image), -1, *image.shape[-2:])
     return cross_bilateral_filter(image, logits, [guide], [torch.full_like(image[:, :1], _FALLOFF)])
-
-
-def has_centred_features(frame: Frame) -> bool:
-    """Whether features come from one ray through the centre of each pixel.
-
-    Averages of several normals are shorter than one, so hardly any pixel may have a short normal. Depth must be smooth:
-    along a plane its inverse is linear in the image, and on a curved surface nearly so, but not if rays pass through
-    random points of a pixel or a lens. Rays passed through the centres if at least a quarter of the triples of
-    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``.
-
-    Args:
-        frame: any; without a normal and a depth the answer is no.
-    """
-    if frame.normal is None or frame.depth is None:
-        return False
-    squares = frame.normal.square().sum(1)
-    # A zero normal: nothing was hit.
-    if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
-        return False
-    even = told = 0
-    for inverse in ((near := frame.depth.detach().reciprocal()), near.mT):
-        a, b, c = inverse[..., :-2], inverse[..., 1:-1], inverse[..., 2:]
-        slope = (a - c).abs()
-        known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
-        told += int(known.sum())
-        even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > told / 4
-
-
-def has_scattered_features(normal: Tensor) -> bool:
-    """Whether features have noise of rays that rough metal and glass scattered.
-
-    Some renderers write the features of the surface that such a ray hits. So few normals ``(B, 3, H, W)`` may differ
-    from all four neighbours where opposite neighbours agree.
-    """
-    left, right = normal.detach()[..., 1:-1, :-2], normal.detach()[..., 1:-1, 2:]
-    above, below = normal.detach()[..., :-2, 1:-1], normal.detach()[..., 2:, 1:-1]
-    inside = normal.detach()[..., 1:-1, 1:-1]
-    nearest = torch.stack([(inside - other).abs().amax(1) for other in (left, right, above, below)]).amin(0)
-    around = torch.maximum((left - right).abs().amax(1), (above - below).abs().amax(1))
-    count = int(((nearest > _UNLIKE) & (around < nearest / 2)).sum())
-    return count > _MOST_SPECKS * nearest.numel()

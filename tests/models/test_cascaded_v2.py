@@ -228,7 +228,7 @@ def test_initial_weights() -> None:
 
 
 def test_the_cost_of_the_family() -> None:
-    macs = {entry.name: entry.kmacs_per_pixel or 0.0 for entry in overview()}
+    macs = {entry.name: entry.kmacs_per_pixel or 0.0 for entry in overview("cascaded_v2*")}
     cost = {name: own / macs["cascaded_v2"] for name, own in macs.items()}
     assert cost["cascaded_v2_small"] == pytest.approx(0.41, abs=0.005)
     assert cost["cascaded_v2_tiny"] == pytest.approx(0.18, abs=0.005)

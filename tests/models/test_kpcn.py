@@ -208,7 +208,7 @@ def test_the_published_size() -> None:
 
 
 def test_the_default_is_small() -> None:
-    (entry,) = (entry for entry in overview() if entry.name == "kpcn")
+    (entry,) = overview("kpcn")
     # Five 5x5 convolutions of 27, 24, 24, 24, 24 and 121 channels; of a frame of color, one branch runs.
     weights = 25 * (27 * 24 + 3 * 24 * 24 + 24 * 121)
     assert entry.kmacs_per_pixel == pytest.approx(weights / 1e3)

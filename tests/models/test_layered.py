@@ -125,7 +125,7 @@ def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
 
 def test_the_default_is_small() -> None:
     """The cost follows from the sizes of the layers: chains, two U-Nets, and the cost of a pixel without samples."""
-    (entry,) = (entry for entry in overview() if entry.name == "layered")
+    (entry,) = overview("layered")
     flat = [(11, 16), (16, 16), (16, 16), (32, 16), (16, 2), (16, 2 * 121 + 1)]
     unets = [
         (entering, leaving, level)

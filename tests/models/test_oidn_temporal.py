@@ -33,8 +33,6 @@ from mcdenoise.models.with_oidn import (
     _merged,
     _phases,
     _without_pattern,
-    has_centred_features,
-    has_scattered_features,
 )
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._steps.transfer import compress
@@ -288,32 +286,6 @@ def plane(offsets: Tensor) -> Frame:
     inverse = 0.2 + 0.004 * (columns + offsets[0]) + 0.003 * (rows + offsets[1])
     normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, 40, 60)
     return Frame(torch.rand(1, 3, 40, 60), normal=normal, depth=(1 / inverse)[None, None])
-
-
-def test_features_of_rays_through_the_centers() -> None:
-    centred = plane(torch.zeros(2, 40, 60))
-    assert has_centred_features(centred)
-    # Files in half precision have such a depth.
-    assert has_centred_features(centred.replace(depth=centred.depth.half().float()))
-    assert not has_centred_features(plane(torch.rand(2, 40, 60)))
-    mixed = centred.normal.clone()
-    mixed[..., ::10] *= 0.8
-    assert not has_centred_features(centred.replace(normal=mixed))
-    assert not has_centred_features(centred.replace(depth=None))
-    assert not has_centred_features(centred.replace(normal=None))
-
-
-def test_features_of_scattered_rays() -> None:
-    normal = plane(torch.zeros(2, 40, 60)).normal
-    assert not has_scattered_features(normal)
-    specks = normal.clone()
-    specks[..., 5::10, 5::10] *= -1
-    assert has_scattered_features(specks)
-    # The edges of an object in front have equal neighbours.
-    edges = normal.clone()
-    edges[..., 10:30, 20:50] *= -1
-    assert not has_scattered_features(edges)
-    assert not has_scattered_features(normal[..., :2, :2])
 
 
 @pytest.mark.parametrize(("offset", "specks"), [(0, 0), (1, 0), (0, 1)])

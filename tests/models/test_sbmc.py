@@ -125,7 +125,7 @@ def test_the_published_size() -> None:
 
 
 def test_the_default_is_small() -> None:
-    (entry,) = (entry for entry in overview() if entry.name == "sbmc")
+    (entry,) = overview("sbmc")
     parameters, macs = weights(16, 3, 2, 11)
     assert entry.parameters == parameters
     assert entry.kmacs_per_pixel == pytest.approx(macs / 1e3)

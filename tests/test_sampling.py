@@ -1,0 +1,74 @@
+"""Exact features are told from noisy ones by their values."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcdenoise.data import open_sequence
+from mcdenoise.frame import Frame
+from mcdenoise.sampling import has_centred_features, has_exact_features, has_scattered_features
+
+HEIGHT, WIDTH = 40, 60
+
+
+def plane(offsets: Tensor) -> Frame:
+    """A plane seen through a point of each pixel: the inverse of its depth is linear in the image."""
+    rows, columns = torch.meshgrid(torch.arange(float(HEIGHT)), torch.arange(float(WIDTH)), indexing="ij")
+    inverse = 0.2 + 0.004 * (columns + offsets[0]) + 0.003 * (rows + offsets[1])
+    normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
+    return Frame(torch.rand(1, 3, HEIGHT, WIDTH), normal=normal, depth=(1 / inverse)[None, None])
+
+
+CENTRED = plane(torch.zeros(2, HEIGHT, WIDTH))
+
+
+def test_a_plane_seen_through_the_centres() -> None:
+    assert has_centred_features(CENTRED)
+    assert has_exact_features(CENTRED)
+    # Files in half precision have such a depth.
+    assert has_centred_features(CENTRED.replace(depth=CENTRED.depth.half().float()))
+
+
+@pytest.mark.parametrize("samples", [1, 4, 16])
+def test_a_plane_seen_through_random_points_of_the_pixels(samples: int) -> None:
+    jitter = (torch.rand(samples, 2, HEIGHT, WIDTH) - 0.5).mean(0)
+    assert not has_centred_features(plane(jitter))
+
+
+def test_normals_of_more_than_one_point() -> None:
+    """Blender's depth is that of the first sample, but its normals are means."""
+    mixed = CENTRED.normal.clone()
+    mixed[..., ::10] = (mixed[..., ::10] + torch.tensor([0, 1.0, 0]).reshape(1, 3, 1, 1)) / 2
+    assert not has_centred_features(CENTRED.replace(normal=mixed))
+    background = CENTRED.normal * (torch.arange(WIDTH) > 9)
+    assert has_centred_features(CENTRED.replace(normal=background))
+
+
+@pytest.mark.parametrize("missing", ["depth", "normal"])
+def test_without_depth_or_normal_the_answer_is_no(missing: str) -> None:
+    assert not has_centred_features(CENTRED.replace(**{missing: None}))
+    assert not has_exact_features(CENTRED.replace(**{missing: None}))
+
+
+def test_surfaces_that_are_nowhere_are_no_evidence() -> None:
+    assert not has_centred_features(CENTRED.replace(depth=torch.full_like(CENTRED.depth, torch.inf)))
+
+
+def test_normals_of_scattered_rays() -> None:
+    assert not has_scattered_features(CENTRED)
+    assert not has_scattered_features(CENTRED.replace(normal=None))
+    specks = CENTRED.normal.clone()
+    specks[..., 5::10, 5::10] *= -1
+    assert has_scattered_features(CENTRED.replace(normal=specks))
+    assert not has_exact_features(CENTRED.replace(normal=specks))
+    # The edges of an object in front have equal neighbours.
+    edges = CENTRED.normal.clone()
+    edges[..., 10:30, 20:50] *= -1
+    assert not has_scattered_features(CENTRED.replace(normal=edges))
+    assert not has_scattered_features(Frame(CENTRED.color[..., :2, :2], normal=CENTRED.normal[..., :2, :2]))
+
+
+def test_the_features_of_a_rendered_frame(small_sequence) -> None:
+    assert has_exact_features(open_sequence(small_sequence).frame(0))
