@@ -21,6 +21,7 @@ from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
+    EXACT,
     FILTERED,
     Journal,
     Model,
@@ -395,8 +396,8 @@ class Denoiser:
 def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
     """The name of the model that suits a frame, and the reason in words.
 
-    ``cascaded_v2`` was trained on features sampled at the pixel centres and one sample a pixel, and is best there.
-    Files of a renderer have features through a pixel filter, for which the others were trained.
+    ``cascaded_v2`` was trained on exact features and one sample a pixel, ``oidn_tuned_exact`` on exact features and 1
+    to 64 samples. Files of a renderer have features through a pixel filter, for which the others were trained.
 
     Args:
         frame: ``None`` for one that is known to have features through a filter.
@@ -404,13 +405,13 @@ def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, 
     """
     exact = frame is not None and has_exact_features(frame)
     if cascade:
-        return DEFAULT if centred else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
-    reason = "features may be noisy, or filtered over pixels"
-    if frame is not None and centred:
+        return DEFAULT if exact else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
+    name, reason = FILTERED, "features may be noisy, or filtered over pixels"
+    if frame is not None and exact:
         if float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
-            return DEFAULT, "features are sampled at the pixel centres, and there is much noise"
-        reason = "features are sampled at the pixel centres, but there is little noise"
-    return FILTERED, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
+            return DEFAULT, "features are exact, and there is much noise"
+        name, reason = EXACT, "features are exact, and there is little noise"
+    return name, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
 
 
 def denoise(
@@ -439,9 +440,8 @@ def denoise(
         albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
-        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if positions, camera and normal tell that the
-            features were sampled at the pixel centres and there is much noise, or if layers, weights or settings are
-            passed; otherwise ``"oidn_tuned"``.
+        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if layers, weights or settings are passed;
+            otherwise that of :func:`mcdenoise.denoiser.suitable_model`.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
         extra: further buffers by name.

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from mcdenoise import denoise
 from mcdenoise.cli import main
@@ -34,9 +33,8 @@ def test_at_pixel_centres_the_noise_decides() -> None:
     clean = frame.replace(color=torch.full_like(frame.color, 0.5))
     assert suitable_model(frame)[0] == "cascaded_v2"
     assert suitable_model(clean) == (
-        "oidn_tuned",
-        "features are sampled at the pixel centres, but there is little noise; "
-        "oidn_temporal usually has a smaller error, but takes longer",
+        "oidn_tuned_exact",
+        "features are exact, and there is little noise; oidn_temporal usually has a smaller error, but takes longer",
     )
     # The settings of its history require a cascade.
     assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
@@ -46,7 +44,7 @@ def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
     assert default_model(sequence) == (
         "cascaded_v2",
-        "features are sampled at the pixel centres, and there is much noise",
+        "features are exact, and there is much noise",
     )
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
@@ -82,7 +80,7 @@ def test_the_command_says_what_it_picked(
     def report(folder: str) -> dict[str, Any]:
         return json.loads((tmp_path / folder / "denoise.json").read_text())
 
-    picked = "cascaded_v2: features are sampled at the pixel centres, and there is much noise"
+    picked = "cascaded_v2: features are exact, and there is much noise"
     assert f"picked {picked}\n" in printed()
     assert report("0")["picked"] == picked
     assert "picked" not in printed("--model", "joint_bilateral")
@@ -96,10 +94,10 @@ def test_the_command_says_what_it_picked(
 
 def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
     frame = exact()
-    arrays = {name: getattr(frame, name)[0].numpy() for name in ("normal", "depth", "position")}
-    color, camera = frame.color[0].numpy(), {"view_projection": CAMERA[0].numpy()}
-    for more, model in ((camera, "cascaded_v2"), ({}, "oidn_tuned")):
-        picked, named = (denoise(color, layout="CHW", **arrays, **more, **given) for given in ({}, {"model": model}))
+    color, normal, depth = (getattr(frame, name)[0].numpy() for name in ("color", "normal", "depth"))
+    for more, model in (({"depth": depth}, "cascaded_v2"), ({}, "oidn_tuned")):
+        arrays = {"layout": "CHW", "normal": normal, **more}
+        picked, named = (denoise(color, **arrays, **given) for given in ({}, {"model": model}))
         np.testing.assert_array_equal(picked, named)
     # Settings are those of the default.
     denoise(color, layout="CHW", alpha_min=0.5)

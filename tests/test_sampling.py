@@ -31,10 +31,8 @@ def test_a_plane_seen_through_the_centres() -> None:
     assert has_centred_features(CENTRED.replace(depth=CENTRED.depth.half().float()))
 
 
-@pytest.mark.parametrize("samples", [1, 4, 16])
-def test_a_plane_seen_through_random_points_of_the_pixels(samples: int) -> None:
-    jitter = (torch.rand(samples, 2, HEIGHT, WIDTH) - 0.5).mean(0)
-    assert not has_centred_features(plane(jitter))
+def test_a_plane_seen_through_random_points_of_the_pixels() -> None:
+    assert not has_centred_features(plane(torch.rand(2, HEIGHT, WIDTH) - 0.5))
 
 
 def test_normals_of_more_than_one_point() -> None:
