@@ -21,7 +21,6 @@ from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
 from mcdenoise.models import (
     DEFAULT,
-    EXACT,
     FILTERED,
     Journal,
     Model,
@@ -396,8 +395,8 @@ class Denoiser:
 def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
     """The name of the model that suits a frame, and the reason in words.
 
-    ``cascaded_v2`` was trained on exact features and one sample a pixel, ``oidn_tuned_exact`` on exact features and 1
-    to 64 samples. Files of a renderer have features through a pixel filter, for which the others were trained.
+    ``cascaded_v2`` was trained on features without noise and one sample a pixel, and is best there. Files of a renderer
+    have features through a pixel filter, for which the others were trained.
 
     Args:
         frame: ``None`` for one that is known to have features through a filter.
@@ -406,12 +405,12 @@ def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, 
     exact = frame is not None and has_exact_features(frame)
     if cascade:
         return DEFAULT if exact else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
-    name, reason = FILTERED, "features may be noisy, or filtered over pixels"
+    reason = "features may be noisy, or filtered over pixels"
     if frame is not None and exact:
         if float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
-            return DEFAULT, "features are exact, and there is much noise"
-        name, reason = EXACT, "features are exact, and there is little noise"
-    return name, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
+            return DEFAULT, "features have no noise, and there is much in the color"
+        reason = "features have no noise, but there is little in the color"
+    return FILTERED, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
 
 
 def denoise(

@@ -202,8 +202,8 @@ def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, st
 
     Args:
         sequence: the shot; its first frame without damage is read if the layout is one that may have features at the
-            pixel centres. (Blender's positions do not tell: they are those of the first sample, which passes through
-            the centre, whatever the filter is.)
+            pixel centres. (Blender's do not tell: with one sample they are those of the pixel centre, whatever the
+            filter is.)
         cascade: whether a cascade is required.
     """
     if sequence.layout != "files":

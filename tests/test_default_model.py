@@ -33,8 +33,9 @@ def test_at_pixel_centres_the_noise_decides() -> None:
     clean = frame.replace(color=torch.full_like(frame.color, 0.5))
     assert suitable_model(frame)[0] == "cascaded_v2"
     assert suitable_model(clean) == (
-        "oidn_tuned_exact",
-        "features are exact, and there is little noise; oidn_temporal usually has a smaller error, but takes longer",
+        "oidn_tuned",
+        "features have no noise, but there is little in the color; "
+        "oidn_temporal usually has a smaller error, but takes longer",
     )
     # The settings of its history require a cascade.
     assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
@@ -44,7 +45,7 @@ def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
     assert default_model(sequence) == (
         "cascaded_v2",
-        "features are exact, and there is much noise",
+        "features have no noise, and there is much in the color",
     )
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
@@ -80,7 +81,7 @@ def test_the_command_says_what_it_picked(
     def report(folder: str) -> dict[str, Any]:
         return json.loads((tmp_path / folder / "denoise.json").read_text())
 
-    picked = "cascaded_v2: features are exact, and there is much noise"
+    picked = "cascaded_v2: features have no noise, and there is much in the color"
     assert f"picked {picked}\n" in printed()
     assert report("0")["picked"] == picked
     assert "picked" not in printed("--model", "joint_bilateral")
