@@ -3,9 +3,9 @@
 The library denoises every frame separately: single images are state of the art, but sequences flicker. It also has to
 be told whether albedo and normal have noise, which rarely holds for a whole image: they are exact on a wall, and noisy
 behind glass, in a blurred mirror and out of focus. This method runs the library for noisy features and for clean ones,
-which it denoises first. The mean of both images is about as good as the better one, without having to know which one
-that is. Then the previous result is blended in, and detail that the library has smoothed is given back. No weights are
-learnt.
+which it denoises first if they have noise. The mean of both images is about as good as the better one, without having
+to know which one that is. Then the previous result is blended in, and detail that the library has smoothed is given
+back. No weights are learnt.
 """
 
 from __future__ import annotations

@@ -47,17 +47,16 @@ class WithOidn(Wrapper):
     """Provides a method with Open Image Denoise's images of each frame.
 
     The method finds them in ``frame.extra``, ``(B, 3, H, W)`` each: ``oidn`` for features treated as noisy;
-    ``oidn_clean`` for features treated as clean, which OIDN denoises first; ``oidn_albedo``, the albedo of these
-    features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred`` ``(B, 1, H, W)``, 1 or 0,
-    see :func:`mcdenoise.sampling.has_centred_features`. Both images are also stages of the output. OIDN always takes
-    the whole image, or, if its noise is correlated (:func:`mcdenoise.noise.noise_is_spread`), four images of half the
-    size. Fireflies are clamped for it (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a
-    little light in return for fewer bright spots.
+    ``oidn_clean`` for features treated as clean, which OIDN denoises first if they have noise; ``oidn_albedo``, the
+    albedo of these features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred``
+    ``(B, 1, H, W)``, 1 or 0, see :func:`mcdenoise.sampling.has_centred_features`. Both images are also stages of the
+    output. OIDN always takes the whole image, or, if its noise is correlated
+    (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size. Fireflies are clamped for it
+    (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a little light in return for fewer
+    bright spots.
 
-    Features of rays through the pixels' centres have no noise unless rays were scattered
-    (:func:`mcdenoise.sampling.has_exact_features`). Whether they are right depends on the radiance: a renderer may
-    place all samples there, or only the first, as Cycles does, whose converged image is anti-aliased. So ``oidn_clean``
-    is then the mean of the images for these features and for denoised ones, and ``oidn_albedo`` is the frame's.
+    Features without noise (:func:`mcdenoise.sampling.has_exact_features`) are taken as they are, which takes half the
+    time and keeps textures of single pixels: ``oidn_clean`` is for them, and ``oidn_albedo`` is the frame's.
 
     Args:
         inner: any method.
@@ -126,14 +125,12 @@ class WithOidn(Wrapper):
         given = without_fireflies(given.map(_phases) if spread else given)
         exact = centred and not has_scattered_features(frame)
         images = {OIDN: (noisy := oidn.denoised(given, "noisy"))}
-        clean = [given] if exact else []
+        clean = given if exact or not self.clean else oidn.with_clean_features(given, self.prefilter)
         if self.clean:
-            clean.append(oidn.with_clean_features(given, self.prefilter))
-            # OIDN takes no normal without an albedo; then all images are the same.
-            made = [noisy] if given.albedo is None else [oidn.denoised(each, "clean") for each in clean]
-            images[OIDN_CLEAN] = torch.stack(made).mean(0)
-        if clean and clean[0].albedo is not None:
-            images[OIDN_ALBEDO] = clean[0].albedo
+            # OIDN takes no normal without an albedo; then both images are the same.
+            images[OIDN_CLEAN] = noisy if given.albedo is None else oidn.denoised(clean, "clean")
+        if clean.albedo is not None and (exact or self.clean):
+            images[OIDN_ALBEDO] = clean.albedo
         if spread:
             images = {name: _without_pattern(_merged(image, frame.size)) for name, image in images.items()}
         images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}
