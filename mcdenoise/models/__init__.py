@@ -44,9 +44,12 @@ from mcdenoise.models.tiled import Region, Tiled
 DEFAULT = "cascaded_v2"
 # For features through a pixel filter, with noise, or of unknown origin.
 FILTERED = "oidn_tuned"
+# The same for features without noise and little noise.
+EXACT = "oidn_tuned_exact"
 
 __all__ = [
     "DEFAULT",
+    "EXACT",
     "FILTERED",
     "FLOATS",
     "PRECISIONS",

@@ -148,6 +148,7 @@ def _with_buffers(module: nn.Module) -> nn.Module:
 _PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("oidn_tuned", "the network of quality balanced", {}),
     ("oidn_tuned_small", "the network of quality fast", {"size": "small"}),
+    ("oidn_tuned_exact", "the network of quality balanced, for features without noise", {}),
 )
 
 

@@ -63,6 +63,8 @@ class TrainConfig:
         gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
         less_noise: probability that the noise of a clip is reduced, unless it is correlated, as if up to 1024 times as
             many samples had been taken; only for models that neither accumulate nor demodulate the color.
+        exact_features: train and validate on sequences with exact features only, see
+            :func:`mcdenoise.sampling.has_exact_features`; the others are left out.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: seed of weights and clips.
     """
@@ -93,6 +95,7 @@ class TrainConfig:
     tint: float = 0.0
     gloss: float = 0.0
     less_noise: float = 0.0
+    exact_features: bool = False
     precision: FloatPrecision = "float32"
     seed: int = 0
 

@@ -11,6 +11,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
+from mcdenoise.sampling import has_exact_features
 from mcdenoise.train.cache import CachedShot, features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
@@ -69,13 +70,22 @@ class DataFolders:
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
                 frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, or
-                ``less_noise`` is set for a model that is given images computed from the color.
+                ``less_noise`` is set for a model that is given images computed from the color, or none has exact
+                features although they are required.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
-        opened = [open_sequence(path) for path in (*training, *validation)]
+        opened = [[open_sequence(path) for path in paths] for paths in (training, validation)]
+        if config.exact_features:
+            opened = [[sequence for sequence in each if _is_exact(sequence)] for each in opened]
+            if not opened[0]:
+                raise InputError(
+                    "exact_features: expected a sequence with features without noise to train on, found none among "
+                    f"{len(training)}; render one with --sampling centre"
+                )
+        both = [*opened[0], *opened[1]]
         # Surfaces without albedo are glossy.
-        common = frozenset.intersection(*(features_of(sequence) for sequence in opened))
+        common = frozenset.intersection(*(features_of(sequence) for sequence in both))
         front = front.of((needs.buffers | needs.uses) & common)
         if config.less_noise and (front.demodulates or front.parts.keys() != {"color"}):
             raise InputError(
@@ -86,10 +96,10 @@ class DataFolders:
         # The cache does not store single samples: methods that take samples are trained on their mean.
         used -= {"samples"}
         wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
-        for sequence in opened:
+        for sequence in both:
             _check_trainable(sequence, wanted)
         features = used & common
-        folders = DataFolders(config, front, features, opened[: len(training)], opened[len(training) :])
+        folders = DataFolders(config, front, features, *opened)
         lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
         check_sizes(lengths, config.frames, config.crop)
         return folders
@@ -146,6 +156,11 @@ class DataFolders:
         """Numbers of the last frames, kept for validation; none if too few frames would remain."""
         enough = len(sequence) >= self.config.frames + self.config.validation_frames
         return sequence.numbers[len(sequence) - self.config.validation_frames :] if enough else []
+
+
+def _is_exact(sequence: Sequence) -> bool:
+    """Whether the features of the first frame are exact."""
+    return has_exact_features(sequence.frame(sequence.numbers[0], reference=False, buffers={"normal", "depth"}))
 
 
 def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, Restored, create_model, describe_weights, load_weights
@@ -664,6 +665,24 @@ def test_settings_that_cannot_be_leave_no_run(
     config = TrainConfig(**{**SMALL, setting: value})
     assert expected in refused(lambda: train(config, [small_sequence], tmp_path / "run"))
     assert not (tmp_path / "run").exists()
+
+
+def test_only_exact_features(small_sequence: Path, tmp_path: Path) -> None:
+    """Normals of several points are shorter than one."""
+    sequence = open_sequence(small_sequence)
+    for number in sequence.numbers:
+        frame = sequence.frame(number)
+        assert frame.normal is not None
+        write_bmfr_frame(tmp_path / "mixed" / "inputs", number, frame.replace(normal=0.8 * frame.normal))
+    cameras = Path("inputs", "camera_matrices.h")
+    shutil.copy(small_sequence / cameras, tmp_path / "mixed" / cameras)
+    folders = [tmp_path / "mixed", small_sequence]
+    config = TrainConfig(**SMALL, exact_features=True)
+    data = data_of(config, *folders, validation=folders, cache=tmp_path / "cache")
+    assert [each["name"] for each in data.description["sequences"]] == ["plane"]
+    assert [each["name"] for each in data.description["validation_sequences"]] == ["plane"]
+    message = refused(lambda: data_of(config, folders[0], cache=tmp_path / "cache"))
+    assert "exact_features: expected a sequence with features without noise to train on, found none among 1" in message
 
 
 def test_a_folder_or_an_accelerator_that_cannot_be(small_sequence: Path, tmp_path: Path) -> None:
