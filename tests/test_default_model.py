@@ -19,6 +19,10 @@ from mcdenoise.frame import Frame
 from mcdenoise.shot import ShotSettings, default_model
 
 HEIGHT, WIDTH = 30, 40
+LITTLE_NOISE = (
+    "features have no noise, and there is little in the color; "
+    "oidn_temporal usually has a smaller error, but takes longer"
+)
 
 
 def exact() -> Frame:
@@ -32,26 +36,19 @@ def test_at_pixel_centres_the_noise_decides() -> None:
     frame = exact()
     clean = frame.replace(color=torch.full_like(frame.color, 0.5))
     assert suitable_model(frame)[0] == "cascaded_v2"
-    assert suitable_model(clean) == (
-        "oidn_tuned",
-        "features have no noise, but there is little in the color; "
-        "oidn_temporal usually has a smaller error, but takes longer",
-    )
+    assert suitable_model(clean) == ("oidn_tuned_exact", LITTLE_NOISE)
     # The settings of its history require a cascade.
     assert suitable_model(clean, cascade=True)[0] == "cascaded_v2"
 
 
 def test_the_layout_of_a_lab_is_examined(small_sequence: Path) -> None:
     sequence = open_sequence(small_sequence)
-    assert default_model(sequence) == (
-        "cascaded_v2",
-        "features have no noise, and there is much in the color",
-    )
+    assert default_model(sequence) == ("oidn_tuned_exact", LITTLE_NOISE)
     assert default_model(replace(sequence, layout="files"))[0] == "oidn_tuned"
     assert default_model(replace(sequence, layout="files"), cascade=True)[0] == "cascaded_v3"
     # A damaged frame is reported when it is denoised, and does not change the choice.
     (small_sequence / "inputs" / "color0.exr").write_bytes(b"damaged")
-    assert default_model(sequence)[0] == "cascaded_v2"
+    assert default_model(sequence)[0] == "oidn_tuned_exact"
 
 
 def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> None:
@@ -81,7 +78,7 @@ def test_the_command_says_what_it_picked(
     def report(folder: str) -> dict[str, Any]:
         return json.loads((tmp_path / folder / "denoise.json").read_text())
 
-    picked = "cascaded_v2: features have no noise, and there is much in the color"
+    picked = f"oidn_tuned_exact: {LITTLE_NOISE}"
     assert f"picked {picked}\n" in printed()
     assert report("0")["picked"] == picked
     assert "picked" not in printed("--model", "joint_bilateral")

@@ -248,6 +248,7 @@ def test_weights_of_another_method_or_width_are_refused(name: str, tmp_path: Pat
             assert refused(lambda: Denoiser(name, weights=path)) == message
     path.write_bytes(weights_of(name))
     others: dict[str, dict[str, Any]] = {"oidn_tuned": {"size": "large"}, "oidn_tuned_small": {"size": "base"}}
+    others["oidn_tuned_exact"] = others["oidn_tuned"]
     size = {"width": 2 * WIDTH} if "width" in find_model(name).architecture else others.get(name, {"layers": 2})
     message = refused(lambda: load_weights(path, name, **size))
     ((setting, value),) = size.items()
