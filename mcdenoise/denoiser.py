@@ -49,8 +49,8 @@ from mcdenoise.sampling import has_exact_features
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
-# Level of noise of frames with some four samples a pixel. On 18 shots with exact features cascaded_v2 had 0.89 to 1.05
-# of the error of oidn_tuned_exact above it, and 0.97 to 1.99 below.
+# Level of noise of frames with some four samples a pixel. On seven sequences with exact features and more noise
+# cascaded_v2 had 0.86 to 1.04 of the error of oidn_tuned_exact, on six with less 0.93 to 2.08.
 _MANY_SAMPLES = 0.25
 
 
@@ -393,15 +393,16 @@ class Denoiser:
         return self._buffers is not None and not self.has_history(self._buffers)
 
 
-def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, str]:
+def suitable_model(frame: Frame | None, *, still: bool = False, cascade: bool = False) -> tuple[str, str]:
     """The name of the model that suits a frame, and the reason in words.
 
-    ``cascaded_v2`` was trained on features without noise and one sample a pixel, ``oidn_tuned_exact`` on features
-    without noise and 1 to 64 samples. Files of a renderer have features through a pixel filter, for which the others
-    were trained.
+    ``cascaded_v2`` was trained on features without noise and one sample a pixel, and is best with a history;
+    ``oidn_tuned_exact`` was trained on features without noise and 1 to 64 samples. Files of a renderer have features
+    through a pixel filter, for which the others were trained.
 
     Args:
         frame: ``None`` for one that is known to have features through a filter.
+        still: whether it is the only frame of its shot.
         cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
     """
     exact = frame is not None and has_exact_features(frame)
@@ -409,9 +410,9 @@ def suitable_model(frame: Frame | None, *, cascade: bool = False) -> tuple[str, 
         return DEFAULT if exact else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
     name, reason = FILTERED, "features may be noisy, or filtered over pixels"
     if frame is not None and exact:
-        if float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
-            return DEFAULT, "features have no noise, and there is much in the color"
-        name, reason = EXACT, "features have no noise, and there is little in the color"
+        if not still and float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
+            return DEFAULT, "features have no noise, and the color of a sequence has much"
+        name, reason = EXACT, f"features have no noise, and the color {'is of a still' if still else 'has little'}"
     return name, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
 
 
@@ -468,7 +469,7 @@ def denoise(
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
     if model is None:
         # Weights and settings are those of the default, and layers are filtered with its kernels.
-        model = DEFAULT if settings or frame.layers else suitable_model(frame)[0]
+        model = DEFAULT if settings or frame.layers else suitable_model(frame, still=True)[0]
     _check_settings(model, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)

@@ -210,7 +210,7 @@ def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, st
         for number in sequence.numbers:
             # A damaged frame is not for this function to report.
             with suppress(InputError):
-                return suitable_model(sequence.frame(number), cascade=cascade)
+                return suitable_model(sequence.frame(number), still=len(sequence) == 1, cascade=cascade)
     return suitable_model(None, cascade=cascade)
 
 

@@ -10,7 +10,7 @@ from mcdenoise.benchmark.tables import remarks
 from mcdenoise.cli._output import progress_bar, say, write_json
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.models import DEFAULT, FILTERED
+from mcdenoise.models import DEFAULT, EXACT, FILTERED
 from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.shot import default_model
 from mcdenoise.suite import (
@@ -50,7 +50,7 @@ def score_suite(
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # Report errors in the choice of methods before hours of rendering.
-    methods = choose_methods(with_peers(models or f"{DEFAULT},{FILTERED}"), precisions=precisions, baselines=("noisy",))
+    methods = choose_methods(with_peers(models or f"{DEFAULT},{EXACT},{FILTERED}"), precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()
     with progress_bar() as progress:

@@ -64,7 +64,7 @@ class TrainConfig:
         less_noise: probability that the noise of a clip is reduced, unless it is correlated, as if up to 1024 times as
             many samples had been taken; only for models that neither accumulate nor demodulate the color.
         exact_features: train and validate on sequences with exact features only, see
-            :func:`mcdenoise.sampling.has_exact_features`; the others are left out.
+            :func:`mcdenoise.sampling.has_exact_features`; the others are skipped.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: seed of weights and clips.
     """

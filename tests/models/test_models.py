@@ -506,7 +506,8 @@ def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
     for settings, found in (({"quality": "high"}, "quality=high"), ({"size": "small"}, "size=small")):
         message = refused(lambda settings=settings: create_model("oidn_tuned", pretrained=True, **settings))
         assert message == (
-            f"{beside}{found}; the weights fix size; for other values train it, or take another model: oidn_tuned_small"
+            f"{beside}{found}; the weights fix size; for other values train it, or take another model: "
+            "oidn_tuned_exact, oidn_tuned_small"
         )
     create_model("oidn_tuned", pretrained=True, size="base")
     message = refused(lambda: create_model("cascaded_v2_micro", pretrained=True, alpha_min=2.0))
