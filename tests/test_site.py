@@ -32,7 +32,7 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     assert "547,673" in own
     # The same figure as in the table that it is taken from.
     assert "| cascaded_v2 | 0.06854 |" in own
-    assert "| run time | 2948 ms at 1280x720 for network and filters, float32, two cores of an Intel Xeon" in own
+    assert "| run time | 2875 ms at 1280x720 for network and filters, float32, two cores of an Intel Xeon" in own
     assert (
         "| run time | 3138 ms at 1280x720 for network and filters, float32, two cores of an AMD"
         in pages["methods/kp.md"]
