@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from planes import plane
 
 from mcdenoise import denoise
 from mcdenoise.cli import main
@@ -18,21 +19,19 @@ from mcdenoise.denoiser import suitable_model
 from mcdenoise.frame import Frame
 from mcdenoise.shot import ShotSettings, default_model
 
-HEIGHT, WIDTH = 30, 40
 LITTLE_NOISE = (
     "features have no noise, and the color has little; oidn_temporal usually has a smaller error, but takes longer"
 )
 
 
-def exact() -> Frame:
+def noisy_plane() -> Frame:
     """A plane seen through the pixel centres, as noisy as with one sample a pixel."""
-    columns = torch.arange(float(WIDTH)).expand(1, 1, HEIGHT, WIDTH)
-    normal = torch.tensor([2**-0.5, 0, -(2**-0.5)]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-    return Frame(torch.rand(1, 3, HEIGHT, WIDTH) ** 4, normal=normal, depth=3 / (1 - columns / (2 * WIDTH)))
+    frame = plane()
+    return frame.replace(color=frame.color**4)
 
 
 def test_at_pixel_centres_the_noise_decides() -> None:
-    frame = exact()
+    frame = noisy_plane()
     clean = frame.replace(color=torch.full_like(frame.color, 0.5))
     assert suitable_model(frame)[0] == "cascaded_v2"
     assert suitable_model(clean) == ("oidn_tuned_exact", LITTLE_NOISE)
@@ -91,7 +90,7 @@ def test_the_command_says_what_it_picked(
 
 
 def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
-    frame = exact()
+    frame = noisy_plane()
     color, normal, depth = (getattr(frame, name)[0].numpy() for name in ("color", "normal", "depth"))
     for more, model in (({"depth": depth}, "oidn_tuned_exact"), ({}, "oidn_tuned")):
         arrays = {"layout": "CHW", "normal": normal, **more}

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
-from torch import Tensor
+from planes import HEIGHT, WIDTH, plane
 
 from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame
 from mcdenoise.sampling import has_centred_features, has_exact_features, has_scattered_features
 
-HEIGHT, WIDTH = 40, 60
-
-
-def plane(offsets: Tensor) -> Frame:
-    """A plane seen through a point of each pixel: the inverse of its depth is linear in the image."""
-    rows, columns = torch.meshgrid(torch.arange(float(HEIGHT)), torch.arange(float(WIDTH)), indexing="ij")
-    inverse = 0.2 + 0.004 * (columns + offsets[0]) + 0.003 * (rows + offsets[1])
-    normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-    return Frame(torch.rand(1, 3, HEIGHT, WIDTH), normal=normal, depth=(1 / inverse)[None, None])
-
-
-CENTRED = plane(torch.zeros(2, HEIGHT, WIDTH))
+CENTRED = plane()
 
 
 def test_a_plane_seen_through_the_centres() -> None:
@@ -68,5 +59,5 @@ def test_normals_of_scattered_rays() -> None:
     assert not has_scattered_features(Frame(CENTRED.color[..., :2, :2], normal=CENTRED.normal[..., :2, :2]))
 
 
-def test_the_features_of_a_rendered_frame(small_sequence) -> None:
+def test_the_features_of_a_rendered_frame(small_sequence: Path) -> None:
     assert has_exact_features(open_sequence(small_sequence).frame(0))

@@ -50,7 +50,8 @@ def score_suite(
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # Report errors in the choice of methods before hours of rendering.
-    methods = choose_methods(with_peers(models or f"{DEFAULT},{EXACT},{FILTERED}"), precisions=precisions, baselines=("noisy",))
+    named = with_peers(models or f"{DEFAULT},{EXACT},{FILTERED}")
+    methods = choose_methods(named, precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()
     with progress_bar() as progress:

@@ -44,7 +44,7 @@ from mcdenoise.models.tiled import Region, Tiled
 DEFAULT = "cascaded_v2"
 # For features through a pixel filter, with noise, or of unknown origin.
 FILTERED = "oidn_tuned"
-# The same for features without noise and little noise.
+# For features without noise, in stills and where the color has little.
 EXACT = "oidn_tuned_exact"
 
 __all__ = [

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from planes import plane
 from torch import Tensor
 from toys import frame_of, refused, whole_frame
 
@@ -65,7 +66,7 @@ def test_a_still_is_a_mean_of_two_images() -> None:
 
 def test_features_without_noise_are_not_denoised() -> None:
     model, oidn = create_model(NAME, threads=1, restore=False), Oidn("high", threads=1)
-    exact = plane(torch.zeros(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
+    exact = plane().replace(albedo=torch.rand(1, 3, 40, 60))
     given = Frame(exact.color, albedo=exact.albedo, normal=exact.normal)
     extra = model.before(exact).extra
     torch.testing.assert_close(extra[OIDN_CLEAN], oidn.denoised(given, "clean"))
@@ -125,7 +126,7 @@ def test_the_image_for_noisy_features_alone(quality: str) -> None:
     assert "oidn_clean" not in output.stages
     assert state is not None
     # Features without noise need no denoising.
-    exact = plane(torch.zeros(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
+    exact = plane().replace(albedo=torch.rand(1, 3, 40, 60))
     extra = model.before(exact).extra
     assert OIDN_CLEAN not in extra
     assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
@@ -279,14 +280,6 @@ def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.M
     assert "pip install 'mcdenoise[oidn]'" in refused(lambda: create_model(NAME))
 
 
-def plane(offsets: Tensor) -> Frame:
-    """A plane seen through a point of each pixel: the inverse of its depth is linear in the image."""
-    rows, columns = torch.meshgrid(torch.arange(40.0), torch.arange(60.0), indexing="ij")
-    inverse = 0.2 + 0.004 * (columns + offsets[0]) + 0.003 * (rows + offsets[1])
-    normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, 40, 60)
-    return Frame(torch.rand(1, 3, 40, 60), normal=normal, depth=(1 / inverse)[None, None])
-
-
 @pytest.mark.parametrize(("offset", "specks"), [(0, 0), (1, 0), (0, 1)])
 def test_features_are_denoised_unless_they_are_exact(offset: int, specks: int) -> None:
     frame = plane(offset * torch.rand(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
@@ -302,7 +295,7 @@ def test_the_texture_of_a_moving_wall_stays_sharp() -> None:
     denoiser = Denoiser(create_model(NAME, threads=1, restore=False))
     errors = []
     for number in range(6):
-        frame = plane(torch.zeros(2, 40, 60))
+        frame = plane()
         columns = (torch.arange(60) + 0.5 * number).floor().long()
         albedo = (0.1 + 0.8 * ((torch.arange(40)[:, None] + columns) % 2)).expand(1, 3, 40, 60).contiguous()
         motion = torch.tensor([0.5, 0.0]).reshape(1, 2, 1, 1).expand(1, 2, 40, 60)
