@@ -11,7 +11,6 @@ the frames after the first, and the peak memory of the process. 7680x4320 takes 
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -27,6 +26,16 @@ from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
 
+# The peak of a process is at least that of the one that started it, which here has made the frame; this one is small.
+LAUNCHER = """
+import os, sys
+command = sys.argv[1:]
+_, status, usage = os.wait4(os.posix_spawn(command[0], command, os.environ), 0)
+if not status:
+    print(usage.ru_maxrss)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
 
 def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
     """Measure the cost of denoising frames of a size in a separate process."""
@@ -36,15 +45,10 @@ def measure(width: int, height: int, options: argparse.Namespace, folder: Path) 
     del frame
     command = [sys.executable, "-m", "mcdenoise", "denoise", folder / "wall", "-o", folder / "out"]
     command += ["--model", options.model, "--precision", options.precision, "--threads", options.threads]
-    with (folder / "log").open("w+") as log:
-        process = subprocess.Popen(
-            [*map(str, command), f"--max-memory={options.max_memory}"], stdout=log, stderr=subprocess.STDOUT
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        log.seek(0)
-        if process.returncode:
-            raise InputError(f"{width}x{height}: expected to be denoised, found: {log.read().strip()[-300:]}")
+    launch = [sys.executable, "-c", LAUNCHER, *command, "--max-memory", options.max_memory]
+    done = subprocess.run(list(map(str, launch)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        raise InputError(f"{width}x{height}: expected to be denoised, found: {done.stdout.strip()[-300:]}")
     report = json.loads((folder / "out" / "denoise.json").read_text())
     stages = {name: spent * 1e6 / (width * height) for name, spent in report["milliseconds"].items()}
     del stages["waiting"]
@@ -53,7 +57,7 @@ def measure(width: int, height: int, options: argparse.Namespace, folder: Path) 
         "network": stages["network"],
         "total": sum(stages.values()),
         "stages": stages,
-        "peak": usage.ru_maxrss * 1024 / 1e9,
+        "peak": int(done.stdout.splitlines()[-1]) * 1024 / 1e9,
         "tiles": report["tiles"],
     }
 

@@ -167,7 +167,8 @@ class Frame:
         specular: ``(B, 3, H, W)`` noisy radiance by specular reflection.
         specular_albedo: ``(B, 3, H, W)`` specular reflectance in [0, 1].
         roughness: ``(B, 1, H, W)`` in [0, 1]; 0 is a mirror.
-        hit_distance: ``(B, 1, H, W)`` length of the first bounce in scene units.
+        hit_distance: ``(B, 1, H, W)`` length of the first bounce in scene units; for methods of your own: no method
+            of the package reads it.
         emission: ``(B, 3, H, W)`` radiance of the surface itself, without noise.
         variance: ``(B, 3, H, W)`` variance of ``color`` as a mean of samples.
         alpha: ``(B, 1, H, W)`` coverage in [0, 1].

@@ -25,8 +25,9 @@ class ShotSettings:
     Args:
         model: a name from `mcdenoise models`, optionally with settings, such as "oidn(quality=fast)"; a weights file;
             or your own model, path/to/file.py:factory or package.module:factory. The default is the model that the
-            weights are for; without weights, cascaded_v2 for noisy frames with features sampled at the pixel centres,
-            and oidn_tuned for others, or cascaded_v3 with layers, alpha, or settings that oidn_tuned does not have.
+            weights are for; without weights, it depends on the frames: where features have no noise, cascaded_v2 for
+            noisy sequences and oidn_tuned_exact for others, else oidn_tuned; or cascaded_v3 with layers, alpha, or
+            settings that oidn_tuned does not have.
         weights: safetensors file of your own weights for that model.
         frames: frames to denoise, such as 0-59,70; all by default.
         device: where the model runs, cpu or cuda.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -34,6 +36,17 @@ def test_settings_of_the_user_are_kept() -> None:
         pytest.skip("this torch has an OpenMP that does not tell its settings")
     assert found["OMP_WAIT_POLICY"] == "ACTIVE"
     assert found.get("GOMP_SPINCOUNT", "7") == "7"
+
+
+def test_the_number_of_threads_is_the_users(small_sequence: Path, tmp_path: Path) -> None:
+    """Also if it is larger than that of the cores."""
+    environment, more = {**os.environ, "OMP_NUM_THREADS": "1"}, 2 * (os.cpu_count() or 1) + 1
+    command = [sys.executable, "-m", "mcdenoise", "denoise", str(small_sequence), "--model", "cascaded_v2_micro"]
+    for expected, options in ((1, []), (more, ["--threads", str(more)])):
+        out = tmp_path / str(expected)
+        done = subprocess.run([*command, "-o", str(out), *options], env=environment, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert json.loads((out / "denoise.json").read_text())["threads"] == expected
 
 
 def test_the_package_alone_imports_no_torch() -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from launched import output_and_peak
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.data import open_sequence
@@ -66,21 +65,8 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
-def denoise(*arguments: object) -> tuple[str, float]:
-    """Return what `mcdenoise denoise` prints, and the peak of its memory in GB."""
-    command = [sys.executable, "-m", "mcdenoise", "denoise", *map(str, arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    assert process.stdout is not None
-    with process.stdout as output:
-        printed = output.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 0, printed
-    return printed, usage.ru_maxrss * 1024 / 1e9
-
-
 def test_the_command_line_says_the_tiles_and_why(sequence: Path, weights: Path, tmp_path: Path) -> None:
-    printed, _ = denoise(sequence, "-o", tmp_path / "out", "--weights", weights, "--tile", "64")
+    printed, _ = output_and_peak("denoise", sequence, "-o", tmp_path / "out", "--weights", weights, "--tile", "64")
     assert "  tiles: 3 x 2 tiles of up to 64x64 pixels: as asked for" in printed
     report = json.loads((tmp_path / "out" / "denoise.json").read_text())
     assert report["tiles"] == "3 x 2 tiles of up to 64x64 pixels: as asked for"
@@ -134,6 +120,6 @@ def test_the_peak_of_memory_stays_below_the_limit(
     frame = synthetic(width, height).replace(motion=None)
     write_bmfr_frame(tmp_path / "large" / "inputs", 0, frame.replace(position=torch.rand_like(frame.color)))
     options = ("--model", model, "--precision", precision, "--max-memory", str(limit))
-    printed, peak = denoise(tmp_path / "large", "-o", tmp_path / "out", *options)
+    printed, peak = output_and_peak("denoise", tmp_path / "large", "-o", tmp_path / "out", *options)
     print(f"{model}, {precision}, {width}x{height}: {peak:.2f} GB\n{printed}")
     assert 0.6 * limit < peak < limit

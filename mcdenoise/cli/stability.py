@@ -6,7 +6,17 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from mcdenoise.check.stability import FRAMES, Check, LongRun, Summary, as_json, groups, parse_dtypes, summarize
+from mcdenoise.check.stability import (
+    FRAMES,
+    VALID_SHOT,
+    Check,
+    LongRun,
+    Summary,
+    as_json,
+    groups,
+    parse_dtypes,
+    summarize,
+)
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import progress_bar, show, write_json
 from mcdenoise.errors import InputError
@@ -46,6 +56,7 @@ def stability(
             for result in group.run():
                 checks.append(result) if isinstance(result, Check) else runs.append(result)
     _print_checks(checks)
+    _print_shots(checks)
     _print_long_runs(runs)
     for note in filter(None, (group.note for group in chosen)):
         print(note)
@@ -80,6 +91,21 @@ def _print_checks(checks: list[Check]) -> None:
         # Names and messages of other people's code are not markup.
         row = (*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
         table.add_row(*map(escape, row))
+    show(table)
+
+
+def _print_shots(checks: list[Check]) -> None:
+    """Print a row for each unusual shot: how many denoisers and dtypes had a valid image, and which had none."""
+    rows: dict[str, list[Check]] = {}
+    for check in checks:
+        if check.what == VALID_SHOT:
+            rows.setdefault(check.case, []).append(check)
+    if not rows:
+        return
+    table = Table("shot", "checks", "every image is finite and not negative")
+    for case, found in rows.items():
+        failed = [f"{check.subject}, {check.dtype}: {check.message}" for check in found if not check.passed]
+        table.add_row(*map(escape, (case, str(len(found)), f"FAILED: {failed[0]}" if failed else "ok")))
     show(table)
 
 

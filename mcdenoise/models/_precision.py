@@ -157,28 +157,34 @@ def _measured(device: torch.device) -> float:
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
     times: dict[FloatPrecision, list[float]] = {precision: [] for precision in FLOATS}
-    watch = Stopwatch(device)
-    with torch.inference_mode():
-        for _ in range(_ROUNDS):
-            for precision, own in times.items():
+    watch, threads = Stopwatch(device), torch.get_num_threads()
+    # On a busy machine, several threads would mostly wait for one another.
+    torch.set_num_threads(1)
+    try:
+        with torch.inference_mode():
+            for precision in FLOATS * _ROUNDS:
                 with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
                     start = watch.mark()
                     F.conv2d(image, weight, padding=1)
-                    own.append(watch.between(start, watch.mark()))
+                    times[precision].append(watch.between(start, watch.mark()))
+    finally:
+        torch.set_num_threads(threads)
     # The first rounds compile kernels.
     exact, rounded = (statistics.median(own[2:]) for own in times.values())
     return exact / rounded
 
 
 def _machine(device: torch.device) -> str:
-    """Identifies the machine: everything that the ratio depends on."""
+    """Identifies the machine, and how the ratio is measured: everything that it depends on."""
     if device.type == "cuda":
         name = torch.cuda.get_device_name(device)
     else:
         known: dict[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
         units = [unit for unit in ("amx_bf16", "avx512_bf16", "bf16") if known.get(unit)]
-        name = " ".join([platform.machine(), str(known.get("cpu_name", "")), *units])
-    return f"{name}, torch {torch.__version__}"
+        # oneDNN, which computes the convolutions, can be told to use fewer of the processor's instructions.
+        told = [os.environ[limit] for limit in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA") if limit in os.environ]
+        name = " ".join([platform.machine(), str(known.get("cpu_name", "")), *units, *told])
+    return f"{name}, torch {torch.__version__}, one thread"
 
 
 def _read(cache: Path) -> dict[str, float]:

@@ -191,7 +191,7 @@ def test_a_model_is_stable() -> None:
 def test_a_denoiser_is_stable() -> None:
     checks = list(check_denoiser("cascaded_v2_micro", (torch.float16,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
-    assert {check.what for check in checks} == {"finite", "contained", "refused", "exposure"}
+    assert {check.what for check in checks} == {"valid", "contained", "refused", "exposure"}
 
 
 OWN = """
@@ -215,7 +215,7 @@ def test_a_users_model_is_checked(tmp_path: Path) -> None:
         checks = list(check_denoiser(f"{path}:{name}", (torch.float32,)))
         assert {check.subject for check in checks} == {f"Denoiser, {path}:{name}"}
         failed[name] = {check.what for check in checks if not check.passed}
-    assert failed == {"same": set(), "brighter": {"exposure"}, "negative": {"finite"}}
+    assert failed == {"same": set(), "brighter": {"exposure"}, "negative": {"valid"}}
 
 
 def test_long_runs() -> None:
@@ -282,6 +282,17 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert {check["subject"] for check in content["checks"]} == {"demodulate"}
     assert {check["dtype"] for check in content["checks"]} == {"float16"}
     assert content["long_runs"] == []
+
+
+def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "own.py"
+    path.write_text("def own():\n    return lambda color, normal: color * (normal.abs().sum(1, keepdim=True) - 0.05)\n")
+    status, out, _ = run(capsys, "--models", f"{path}:own", "--dtypes", "float32")
+    assert status == 1
+    rows = {}
+    for case in ("depth 0 in some rows", "normal 0 in some rows", "albedo 93 in some rows", "hit distance 0"):
+        (rows[case],) = (line for line in out.splitlines() if f" {case} " in line)
+    assert [case for case, row in rows.items() if "FAILED" in row] == ["normal 0 in some rows"]
 
 
 def test_the_command_names_backends_that_cannot_run(

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from mcdenoise import Denoiser, Frame, InputError, denoise
 from mcdenoise.models import _precision, fastest_precision
@@ -97,6 +99,31 @@ def test_measuring_draws_none_of_the_callers_random_numbers() -> None:
     before = torch.get_rng_state()
     assert 0.01 < _measured(CPU) < 100
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_measurement_is_of_one_thread_and_leaves_the_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, conv2d, seen = torch.get_num_threads(), F.conv2d, set()
+
+    def watched(*arguments: Any, **settings: Any) -> torch.Tensor:
+        seen.add(torch.get_num_threads())
+        return conv2d(*arguments, **settings)
+
+    monkeypatch.setattr(F, "conv2d", watched)
+    try:
+        torch.set_num_threads(2)
+        _measured(CPU)
+        assert seen == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_a_limit_of_instructions_is_another_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ONEDNN_MAX_CPU_ISA", raising=False)
+    unlimited = _machine(CPU)
+    assert torch.__version__ in unlimited
+    monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", "AVX2")
+    assert _machine(CPU) != unlimited
 
 
 def test_who_gets_it(measured: list[float]) -> None:

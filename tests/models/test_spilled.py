@@ -7,9 +7,7 @@ import gc
 import json
 import os
 import shutil
-import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from launched import output_and_peak
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
@@ -125,15 +124,9 @@ def test_a_sequence_of_8k_within_4_gb(small_sequence: Path, tmp_path: Path) -> N
         kept = ("color", "albedo", "normal", "position")
         write_bmfr_frame(inputs, number, Frame(**{name: large[name] for name in kept}))
     shutil.copy(small_sequence / "inputs/camera_matrices.h", inputs)
-    command = [sys.executable, "-m", "mcdenoise", "denoise", str(tmp_path / "large"), "-o", str(tmp_path / "out")]
-    command += ["--model", "cascaded_v2_micro", "--precision", "float32", "--max-memory", "4"]
-    with tempfile.TemporaryFile("w+") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        log.seek(0)
-        assert process.returncode == 0, log.read()
+    settings = ("--model", "cascaded_v2_micro", "--precision", "float32", "--max-memory", "4")
+    _, peak = output_and_peak("denoise", tmp_path / "large", "-o", tmp_path / "out", *settings)
     report = json.loads((tmp_path / "out/denoise.json").read_text())
     assert report["tiles"].endswith("the history is in a file")
     assert np.mean([each["history"] for each in list(report["frames"].values())[1:]]) > 0.5
-    assert usage.ru_maxrss * 1024 < 4 * GB
+    assert peak < 4

@@ -14,7 +14,7 @@ from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import create_model, describe_weights, load_weights, pretrained_models, save_weights
+from mcdenoise.models import _precision, create_model, describe_weights, load_weights, pretrained_models, save_weights
 from mcdenoise.nn import UNet
 from mcdenoise.nn.int8 import Convolution, Int8UNet, Stored, has_int8, integers, measure
 
@@ -188,6 +188,12 @@ def test_shipped_weights_are_calibrated(name: str) -> None:
     image = Denoiser(name, precision="int8")(frame)
     assert image.isfinite().all()
     assert torch.equal(image, Denoiser(name, precision="int8")(frame))
+
+
+def test_a_processor_without_dot_products_is_told_what_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_precision, "has_int8", lambda: False)
+    with pytest.raises(InputError, match=r"dot products of 8-bit integers \(VNNI\) .*, found none; take bfloat16"):
+        Denoiser("cascaded_v2_micro", precision="int8")
 
 
 def test_methods_that_integers_cannot_compute_are_refused() -> None:

@@ -13,7 +13,7 @@ import torch
 from mcdenoise.check.own import note_of
 from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
 from mcdenoise.check.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
-from mcdenoise.check.stability._denoiser import check_denoiser
+from mcdenoise.check.stability._denoiser import VALID_SHOT, check_denoiser
 from mcdenoise.check.stability._long_runs import FRAMES, LongRun, long_runs
 from mcdenoise.check.stability._models import check_model
 from mcdenoise.check.stability._ops import check_case, check_op, check_stability
@@ -24,6 +24,7 @@ from mcdenoise.models import list_models
 __all__ = [
     "DTYPES",
     "FRAMES",
+    "VALID_SHOT",
     "Check",
     "Group",
     "LongRun",

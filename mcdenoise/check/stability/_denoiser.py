@@ -19,6 +19,8 @@ from mcdenoise.models import DEFAULT, Output, Precision
 from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN
 
 FRAMES = 3
+# The property of a denoiser that is checked on each shot of unusual values.
+VALID_SHOT = "valid"
 _SIZE = (17, 23)
 _MIDDLE = (8, 11)
 _PROBE = 8
@@ -135,7 +137,7 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
             image = denoiser(frame)
         if not torch.isfinite(image).all() or not (image >= 0).all():
             message = message or f"frame {number}: NaN, infinite or negative pixels"
-    return _found(name, dtype, "finite", message)
+    return _found(name, dtype, VALID_SHOT, message)
 
 
 def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
