@@ -176,7 +176,7 @@ def test_a_compiled_step_is_the_step(backend: str, mine: str) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-@pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny", "cascaded_v2_small", "cascaded_v2"])
+@pytest.mark.parametrize("name", pretrained_models())
 def test_a_compiled_step_of_the_zoo_is_the_step(name: str) -> None:
     model = create_model(name, pretrained=True)
     torch._dynamo.reset()
