@@ -11,7 +11,6 @@ the frames after the first, and the peak memory of the process. 7680x4320 takes 
 
 import argparse
 import json
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -20,21 +19,12 @@ import torch
 
 from mcdenoise.benchmark import parse_sizes
 from mcdenoise.benchmark.machine import describe_machine
+from mcdenoise.benchmark.memory import output_and_peak
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
-
-# The peak of a process is at least that of the one that started it, which here has made the frame; this one is small.
-LAUNCHER = """
-import os, sys
-command = sys.argv[1:]
-_, status, usage = os.wait4(os.posix_spawn(command[0], command, os.environ), 0)
-if not status:
-    print(usage.ru_maxrss)
-sys.exit(os.waitstatus_to_exitcode(status))
-"""
 
 
 def measure(width: int, height: int, options: argparse.Namespace, folder: Path) -> dict[str, object]:
@@ -43,12 +33,12 @@ def measure(width: int, height: int, options: argparse.Namespace, folder: Path) 
     for number in range(options.frames):
         write_bmfr_frame(folder / "wall" / "inputs", number, frame)
     del frame
-    command = [sys.executable, "-m", "mcdenoise", "denoise", folder / "wall", "-o", folder / "out"]
-    command += ["--model", options.model, "--precision", options.precision, "--threads", options.threads]
-    launch = [sys.executable, "-c", LAUNCHER, *command, "--max-memory", options.max_memory]
-    done = subprocess.run(list(map(str, launch)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    if done.returncode:
-        raise InputError(f"{width}x{height}: expected to be denoised, found: {done.stdout.strip()[-300:]}")
+    settings = ("--model", options.model, "--precision", options.precision, "--threads", options.threads)
+    limit = ("--max-memory", options.max_memory)
+    try:
+        _, peak = output_and_peak("denoise", folder / "wall", "-o", folder / "out", *settings, *limit)
+    except InputError as error:
+        raise InputError(f"{width}x{height}: {error}") from error
     report = json.loads((folder / "out" / "denoise.json").read_text())
     stages = {name: spent * 1e6 / (width * height) for name, spent in report["milliseconds"].items()}
     del stages["waiting"]
@@ -57,7 +47,7 @@ def measure(width: int, height: int, options: argparse.Namespace, folder: Path) 
         "network": stages["network"],
         "total": sum(stages.values()),
         "stages": stages,
-        "peak": int(done.stdout.splitlines()[-1]) * 1024 / 1e9,
+        "peak": peak,
         "tiles": report["tiles"],
     }
 

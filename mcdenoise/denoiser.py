@@ -49,8 +49,7 @@ from mcdenoise.sampling import has_exact_features
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
-# Level of noise of frames with some four samples a pixel. On eight sequences with exact features and more noise
-# cascaded_v2 had 0.86 to 1.04 of the error of oidn_tuned_exact, on five with less 0.93 to 2.08.
+# Level of noise of frames with some eight samples a pixel; training/README.md has the errors of both models.
 _MANY_SAMPLES = 0.1
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from launched import output_and_peak
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise.benchmark.memory import output_and_peak
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.folder import denoise_sequence

@@ -1,4 +1,4 @@
-"""Measurement of the peak memory of a method."""
+"""Measurement of the peak memory of a method, and of a command."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import functools
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,6 +18,7 @@ import torch
 
 from mcdenoise.benchmark.machine import fix_threads
 from mcdenoise.benchmark.methods import make_method
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Method
@@ -27,6 +30,30 @@ _STATUS, _FORGET_PEAK = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 # Modules that methods import, at the latest when they run; the first custom operator imports torch._dynamo.
 _PRELOADED = ["__main__", "torch._dynamo", "numba", "pyoidn", "mcdenoise.benchmark.run"]
 _SECONDS = 300.0
+# A process that is as small as Python is: the peak of a process is at least that of the one that started it.
+_LAUNCHER = """
+import os, sys
+command = sys.argv[1:]
+_, status, usage = os.wait4(os.posix_spawn(command[0], command, os.environ), 0)
+if not status:
+    print(usage.ru_maxrss)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+
+
+def output_and_peak(*arguments: object) -> tuple[str, float]:
+    """Return what ``mcdenoise`` prints with these arguments, and the peak of its resident set size in GB, on Linux.
+
+    Raises:
+        InputError: the command fails; the message ends with the last line that it printed.
+    """
+    command = [sys.executable, "-c", _LAUNCHER, sys.executable, "-m", "mcdenoise", *map(str, arguments)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        last = done.stdout.strip().rpartition("\n")[2]
+        raise InputError(f"mcdenoise {arguments[0]}: expected to succeed, found: {last}")
+    printed, _, kibibytes = done.stdout.rstrip("\n").rpartition("\n")
+    return printed, int(kibibytes) * 1024 / 1e9
 
 
 class Peaks:

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from launched import output_and_peak
 
 from mcdenoise import Denoiser, Frame
+from mcdenoise.benchmark.memory import output_and_peak
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError
