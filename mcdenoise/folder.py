@@ -200,6 +200,7 @@ def write_frames(
     references: bool = False,
     unwritten: Collection[int] = (),
     of: int | None = None,
+    on_read: Callable[[int], object] = lambda number: None,
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
     on_file: Callable[[int, Tensor], None] | None = None,
@@ -216,6 +217,7 @@ def write_frames(
         references: see :func:`denoise_sequence`.
         unwritten: frames that are denoised only to give the others their history; no files are written for them.
         of: number of frames of the whole shot, if these are its beginning; by default the shot ends with them.
+        on_read: called with the number of each frame before its files are read, in the reading thread.
         on_frame: see :func:`denoise_sequence`.
         on_output: see :func:`denoise_sequence`.
         on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the writing thread, after its
@@ -251,7 +253,7 @@ def write_frames(
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         seen: Tensor | None = None
-        for number, frame, times in _read_frames(sequence, denoiser, reference=references, of=of):
+        for number, frame, times in _read_frames(sequence, denoiser, reference=references, of=of, on_read=on_read):
             output = _denoised(step, sequence, number, denoiser, frame, times)
             if on_output is not None:
                 on_output(frame, output)
@@ -312,7 +314,12 @@ class _Times(NamedTuple):
 
 
 def _read_frames(
-    sequence: Sequence, denoiser: Denoiser, *, reference: bool, of: int | None = None
+    sequence: Sequence,
+    denoiser: Denoiser,
+    *,
+    reference: bool,
+    of: int | None = None,
+    on_read: Callable[[int], object] = lambda number: None,
 ) -> Iterator[tuple[int, Frame, _Times]]:
     """Read each frame, and the next one ahead if memory allows. Resets the denoiser."""
     needs = denoiser.model.needs
@@ -324,6 +331,7 @@ def _read_frames(
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
+        on_read(number)
         frame = sequence.frame(number, reference=reference, buffers=wanted)
         # Depth may be computed from the positions.
         frame = frame if streaming else frame.with_depth().without_history()

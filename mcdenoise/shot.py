@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as Sequential
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT, describe_weights
+
+if TYPE_CHECKING:
+    from mcdenoise.preview import Preview
 
 # With very many threads torch crashes instead of raising an error.
 _MOST_THREADS = 1024
@@ -102,10 +107,23 @@ class ShotSettings:
             raise InputError(f"--alpha-min: expected in (0, 1], found {self.alpha_min}")
         if not self.preview and (self.preview_fps != 24.0 or self.preview_exposure is not None):
             raise InputError("--preview-fps, --preview-exposure: expected together with --preview")
+        if self.preview:
+            # A single frame gets no video, so that the usual rate is not looked at.
+            self.preview_in(Path(), video=self.preview_fps != 24.0)
+        for name, limit in (("budget-ms", self.budget_ms), ("max-error", self.max_error)):
+            if limit is not None and not 0 < limit < math.inf:
+                raise InputError(f"--{name}: expected a number above 0, found {limit:g}")
         if self.color_with_albedo and self.color_without_albedo:
             raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
         if self.is_budgeted and (self.weights is not None or self.model is not None):
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
+
+    def preview_in(self, folder: Path, *, video: bool) -> Preview:
+        """The preview that these settings ask for, see :class:`mcdenoise.preview.Preview`."""
+        # Imported here because it loads kornia, which denoising does not need.
+        from mcdenoise.preview import Preview
+
+        return Preview(folder, video=video, frames_per_second=self.preview_fps, exposure=self.preview_exposure)
 
     @property
     def is_budgeted(self) -> bool:

@@ -59,14 +59,15 @@ ALLOWED: dict[str, set[str]] = {
     # These modules are for scripts of a renderer: nothing of the package imports them.
     "integrations": SIGNAL | {"models", "denoiser"},
     "folder": LIBRARY,
-    "shot": LIBRARY | {"budget", "methods"},
+    "shot": LIBRARY | {"budget", "methods", "preview"},
     "check": LIBRARY | {"methods", "own"},
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "models"},
     "report": LIBRARY | {"evaluate", "results"},
     "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS - {"film"}, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
-    "film": LIBRARY | {"commit", "engines", "folder", "heap", "interruption", "methods", "preview", "report", "shot"},
+    "film": LIBRARY
+    | {"commit", "engines", "folder", "heap", "interruption", "methods", "preview", "report", "results", "shot"},
     "cli": LIBRARY | TOOLS | {"engines", "heap", "interruption", "results", "shot", "threads"},
     "__main__": {"cli"},
     # The package itself, `from mcdenoise import Frame`: for users, and never imported from within.

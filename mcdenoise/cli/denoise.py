@@ -48,17 +48,7 @@ def denoise(
     if shot.threads is not None:
         torch.set_num_threads(shot.threads)
     opened = shot.open(inputs)
-    shown = None
-    if shot.preview:
-        # Imported here because it loads kornia, which denoising does not need.
-        from mcdenoise.preview import Preview
-
-        shown = Preview(
-            out,
-            video=len(opened) > 1,
-            frames_per_second=shot.preview_fps,
-            exposure=shot.preview_exposure,
-        )
+    shown = shot.preview_in(out, video=len(opened) > 1) if shot.preview else None
     if shot.is_budgeted:
         with progress_bar() as progress:
             task = progress.add_task("measure models", total=None)

@@ -104,4 +104,5 @@ def _print_shot(result: ShotResult) -> None:
     rate = f", {result.rate:.2f}/s" if result.made else ""
     there = f", {kept} were there" if kept else ""
     failed = f", {len(result.failed)} failed" if result.failed else ", failed" if result.reason else ""
-    say(f"  {result.shot.name}: {frames} frames, {result.made} made{rate}{there}{failed}")
+    picked = f"; picked {result.found.shot.picked}" if result.found is not None and result.found.shot.picked else ""
+    say(f"  {result.shot.name}: {frames} frames, {result.made} made{rate}{there}{failed}{picked}")

@@ -8,14 +8,14 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import held, sweep, write_text
-from mcdenoise.engines import MOST_LOSSES, Done, Engine, describe_error
+from mcdenoise.engines import MOST_LOSSES, Done, Engine, RayEngine, describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
@@ -23,6 +23,7 @@ from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import Tail, read_journal
 from mcdenoise.film.work import RECORDS, Found, Made, Order, Summary
 from mcdenoise.folder import make_folder
+from mcdenoise.results import Results
 
 _SECONDS_BETWEEN_POLLS = 0.2
 # Seconds between reading all journals: a thousand of them cost no more than some hundred reads a second.
@@ -67,6 +68,7 @@ class ShotResult:
         traces: tracebacks of failures that the input did not cause.
         begun: time at which the first piece was started, seconds.
         ended: time at which the last piece ended, seconds.
+        repeated: number of frames that were denoised again because their files had changed meanwhile.
         pieces: number of pieces into which the shot was cut.
         waiting: number of pieces that have not ended.
     """
@@ -80,6 +82,7 @@ class ShotResult:
     traces: list[str] = field(default_factory=list)
     begun: float = 0.0
     ended: float = 0.0
+    repeated: int = 0
     pieces: int = 0
     waiting: int = 0
 
@@ -162,9 +165,11 @@ def run_film(
         on_shot: called with each shot that is summarized, or has failed.
 
     Raises:
-        InputError: the folder cannot be written to, or another process writes a film to it.
+        InputError: a model cannot be built with the settings of its shot, the folder cannot be written to, or another
+            process writes a film to it. No frame is made then.
     """
     try:
+        _check(film, device="cpu" if isinstance(engine, RayEngine) else "")
         make_folder(film.out / RECORDS)
         with held(film.out / RECORDS, "film"):
             run = _Run(film, engine, on_progress, on_shot)
@@ -175,6 +180,30 @@ def run_film(
                 run.sweep()
     finally:
         engine.close()
+
+
+def _check(film: Film, device: str) -> None:
+    """Build each model once: a misspelt one would otherwise be found after other shots are denoised.
+
+    Args:
+        film: the film.
+        device: to build them on; that of the shot by default.
+    """
+    checked = set()
+    for shot in film.shots:
+        settings = replace(shot.settings, frames=None, device=device or shot.settings.device)
+        # To measure which precision is fast takes time, and one that is not named is checked with its model.
+        named = settings.model is not None or settings.weights is not None
+        if settings.precision != "int8" or not named:
+            settings = replace(settings, precision="float32")
+        if settings not in checked:
+            checked.add(settings)
+            try:
+                settings.denoiser()
+                if settings.results is not None:
+                    Results.read(settings.results)
+            except InputError as error:
+                raise InputError(f"shot '{shot.name}': {error}") from error
 
 
 class _Run:
@@ -249,8 +278,7 @@ class _Run:
         elif task.kind == "make":
             self._made(task, done.answer)
         else:
-            task.result.summary = done.answer
-            self.on_shot(task.result)
+            self._summarized(task.result, done.answer)
 
     def _scanned(self, result: ShotResult, found: Found) -> None:
         self.unscanned -= 1
@@ -285,6 +313,18 @@ class _Run:
     def _summarize(self, result: ShotResult) -> None:
         self.queue.appendleft(_Task("summarize", result))
 
+    def _summarized(self, result: ShotResult, summary: Summary) -> None:
+        """Denoise frames again whose files have changed meanwhile, once; those that change again are not finished."""
+        changed = set(summary.unfinished) - set(result.failed)
+        if changed and not result.repeated:
+            result.repeated = len(changed)
+            self._cut(result, changed)
+            return
+        reason = "its files have changed while the film was made, and once more; run the same command when they stay"
+        result.failed.update(dict.fromkeys(changed, reason))
+        result.summary = summary
+        self.on_shot(result)
+
     def _lost(self, task: _Task, why: str) -> None:
         """Retry a task whose worker is lost; the frames that it has finished are on the disk."""
         done = _finished(task)
@@ -317,7 +357,9 @@ class _Run:
                 if task.tail is not None:
                     task.result.made += task.tail.new()
         known = [each for each in self.result.shots if each.found is not None]
-        total = sum(len(each.found.numbers) - len(each.found.done) for each in known if each.found is not None)
+        total = sum(
+            len(each.found.numbers) - len(each.found.done) + each.repeated for each in known if each.found is not None
+        )
         progress = (self.result.made, None if self.unscanned else total)
         if progress != self.reported:
             self.reported = progress
@@ -357,7 +399,7 @@ def _shot_as_json(result: ShotResult) -> dict[str, Any]:
     }
     if result.found is not None:
         found = {"frames": list(result.found.numbers), "found_finished": len(result.found.done)}
-        about |= {**found, "overlap": result.found.overlap, "chosen": result.found.choice}
+        about |= {**found, "overlap": result.found.overlap, "picked": shot.picked}
     if result.summary is not None:
         about |= _summary_as_json(result.summary)
     return about

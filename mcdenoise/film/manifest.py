@@ -22,6 +22,7 @@ PICTURES = "film_pictures"
 _TAKEN = {"film.json", "film.html", PICTURES}
 _OWN = ("name", "input")
 _LONGEST_NAME = 200
+_LIMIT = 2**63
 _WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
 
 
@@ -33,11 +34,13 @@ class Shot:
         name: of its folder in the output.
         inputs: folders, files or patterns, as absolute paths.
         settings: how it is denoised, with absolute paths.
+        picked: the model that was picked, and why; empty if it was named, and before the scan.
     """
 
     name: str
     inputs: tuple[Path, ...]
     settings: ShotSettings
+    picked: str = ""
 
 
 def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot]:
@@ -68,7 +71,8 @@ def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot
 
 def _of_pattern(pattern: Path, settings: ShotSettings) -> list[Shot]:
     found = sorted(Path(path) for path in glob.glob(str(pattern)) if os.path.isdir(path))
-    if not found:
+    # The working folder has no part that could name its shot.
+    if not found or not pattern.parts:
         raise InputError(
             f"{pattern}: expected a manifest (.toml), or a pattern of folders such as 'renders/*', found neither; "
             "check the path, and put the pattern into quotes"
@@ -83,7 +87,8 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
         content = tomllib.loads(read_text(path))
     except OSError as error:
         raise InputError(f"{path}: expected a manifest of a film, found: {error.strerror}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    # An integer of too many digits is a ValueError, as are all others.
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected TOML, found: {error}; mend it there") from error
     if unknown := sorted(content.keys() - {"shot", "every"}):
         raise InputError(
@@ -169,6 +174,9 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
     fits = isinstance(value, bool) is (kind is bool) and isinstance(
         value, (int, float) if kind is float else str if kind is Path else kind
     )
+    # Written so that NaN is out of range.
+    if fits and not isinstance(value, str) and not abs(value) < _LIMIT:
+        raise InputError(f"{where}: expected {_WORDS[kind]} below 2^63, found {_found(value)}; change it")
     if not fits:
         raise InputError(f"{where}: expected {_WORDS[kind]}, found {_found(value)}; change it")
     return kind(value)
@@ -193,5 +201,9 @@ def _absolute(settings: ShotSettings, base: Path, chosen: Collection[str] | None
 
 
 def _found(value: Any) -> str:
-    text = printable(repr(value))
+    try:
+        text = printable(repr(value))
+    except ValueError:
+        # A hexadecimal integer may have more digits than Python prints.
+        text = "a number of thousands of digits"
     return "nothing" if value is None else text if len(text) <= 80 else f"{text[:77]}..."

@@ -63,6 +63,7 @@ def _shown(result: ShotResult) -> dict[str, Any]:
         "score": worst[0]["score"] if worst else 0.0,
         "frames": len(result.found.numbers) if result.found is not None else 0,
         "made": result.made,
+        "picked": result.found.shot.picked if result.found is not None else "",
         "rate": result.rate,
         "failures": result.failures(),
         "warnings": () if result.summary is None else result.summary.warnings,

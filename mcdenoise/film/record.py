@@ -1,8 +1,9 @@
 """Records of finished frames, by which the next run knows that they need not be denoised again.
 
 A record has the key of its frame: a digest of the bytes of the frame's files and of the frames in its history, of the
-settings, the weights and the version. It also has size and modification time of each file, as the index of a version
-control system has: a file with the same size and time is not read again, so that a scan costs one stat call a file.
+settings, the weights and the version. It also has size and time of the last change of each file, as the index of a
+version control system has: a file with the same size and time is not read again, so that a scan costs one stat call a
+file. The time of a file that had just changed is not kept, because the next change may have the same one.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from mcdenoise.denoiser import FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.models import Stage
 
-# Path, size, time of the last change in nanoseconds.
+# Path, size, time of the last change in nanoseconds; a time of -1 is that of no file.
 Stamp = tuple[str, int, int]
+# Nanoseconds, the largest step of the clock of a file system.
+_YOUNG = 2_000_000_000
 _BLOCK, _REMEMBERED = 1 << 20, 256
 
 
@@ -100,7 +103,12 @@ class Digests:
     def of(self, path: Path) -> tuple[Stamp, str]:
         """Stamp and digest of a file; the digest of a file that cannot be read is empty."""
         try:
-            found = stamp(path)
+            status = os.stat(path)
+            # A copy may keep the time of its source, but not that of the last change of its entry.
+            changed = max(status.st_mtime_ns, status.st_ctime_ns)
+            if time.time_ns() - changed <= _YOUNG:
+                return (str(path), status.st_size, -1), digest_of(path)
+            found = str(path), status.st_size, changed
             digest = self._recorded.get(found) or self._computed.pop(found, "") or digest_of(path)
             # The newest entry is the last one of the dictionary, and the first one is dropped.
             self._computed[found] = digest

@@ -89,12 +89,11 @@ class Found:
     """The result of :func:`scan`.
 
     Args:
-        shot: the shot, with the model that was chosen, if a measurement chooses it.
+        shot: the shot, with the model that was picked, if none is named.
         numbers: numbers of all frames.
         done: numbers of the finished frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
         overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
-        choice: the model that was chosen, in words.
         warnings: of the reader.
     """
 
@@ -103,7 +102,6 @@ class Found:
     done: frozenset[int]
     unreadable: Mapping[int, str]
     overlap: int | None
-    choice: str = ""
     warnings: tuple[str, ...] = ()
 
 
@@ -131,6 +129,7 @@ class Summary:
             with the whole history, and with that of the overlap alone.
         pictures: paths of the thumbnails, by number of the frame, relative to the page.
         warnings: what is probably wrong, a line each.
+        unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
     """
 
     milliseconds: Mapping[str, float]
@@ -138,6 +137,7 @@ class Summary:
     joints: Mapping[int, float]
     pictures: Mapping[int, str]
     warnings: tuple[str, ...]
+    unfinished: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,6 @@ class _Opened:
     denoiser: Denoiser
     overlap: int | None
     unreadable: Mapping[int, str]
-    choice: str
     settings: str
 
     def window(self, number: int) -> list[int]:
@@ -162,13 +161,15 @@ class _Opened:
 class _Keys:
     """Keys of frames. Frames are asked for in ascending order, so that each file is read at most once.
 
+    A digest that is taken before the frame is read is that of the pixels, or of a file that is replaced meanwhile: then
+    it is that of no file any more, and the frame is not taken for a finished one.
+
     Args:
         opened: the shot.
-        digests: of its files.
     """
 
-    def __init__(self, opened: _Opened, digests: Digests) -> None:
-        self.opened, self.digests = opened, digests
+    def __init__(self, opened: _Opened) -> None:
+        self.opened, self.digests = opened, Digests()
         self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
 
     def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
@@ -181,8 +182,17 @@ class _Keys:
         """The key of a frame: a digest of all that decides its result."""
         window = self.opened.window(number)
         key = digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
-        self._inputs = {each: found for each, found in self._inputs.items() if each >= window[0]}
+        # The next frames are added in another thread.
+        for each in [each for each in list(self._inputs) if each < window[0]]:
+            del self._inputs[each]
         return key
+
+    def finished(self, order: Order) -> dict[int, FrameRecord]:
+        """The records of the finished frames: whose results, inputs and settings are still those of the record."""
+        records = read_records(order.records)
+        self.digests.learn(records.values())
+        numbers = [n for n in self.opened.sequence.numbers if n in records and order.has(records[n])]
+        return {n: records[n] for n in numbers if records[n].key == self.key(n)}
 
 
 def scan(order: Order) -> Found:
@@ -192,21 +202,13 @@ def scan(order: Order) -> Found:
         InputError: the shot cannot be opened, or cannot be denoised with these settings.
     """
     opened = _opened(order)
-    records, digests = read_records(order.records), Digests()
-    digests.learn(records.values())
-    keys = _Keys(opened, digests)
-    done = {
-        number
-        for number in opened.sequence.numbers
-        if number in records and order.has(records[number]) and records[number].key == keys.key(number)
-    }
+    done = _Keys(opened).finished(order)
     return Found(
         opened.shot,
         tuple(opened.sequence.numbers),
         frozenset(done),
         opened.unreadable,
         opened.overlap,
-        opened.choice,
         tuple(opened.sequence.warnings),
     )
 
@@ -231,12 +233,12 @@ def make(order: Order, piece: Piece, journal: Path) -> Made:
     check_apart(opened.sequence, order.folder)
     # That file says that the shot is complete.
     remove(order.folder / "denoise.json")
-    numbers, left = list(piece.numbers), set(piece.wanted)
+    numbers, left, keys = list(piece.numbers), set(piece.wanted), _Keys(opened)
     failed: dict[int, str] = {}
     try:
         with Journal(journal).open() as own:
             while left:
-                writer = _Writer(order, opened, own, piece.joint, left)
+                writer = _Writer(order, keys, own, piece.joint, left)
                 try:
                     writer.write(numbers)
                 except FrameError as error:
@@ -258,16 +260,16 @@ def summarize(order: Order) -> Summary:
         InputError: as :func:`scan`, or something cannot be written.
     """
     opened = _opened(order)
-    found = read_records(order.records)
-    records = [found[n] for n in opened.sequence.numbers if n in found and order.has(found[n])]
-    report = new_report(opened.sequence, _name(opened.shot), opened.choice)
+    found = _Keys(opened).finished(order)
+    records = list(found.values())
+    report = new_report(opened.sequence, _name(opened.shot), opened.shot.picked)
     report.frames = {each.number: each.report for each in records}
     report.files = {each.number: order.result(each) for each in records}
     report.alike = [each.number for each in records if each.alike]
     for folder in (order.folder, order.records):
         sweep(folder, youngest=0)
-    whole = len(records) == len(opened.sequence.numbers) and not opened.unreadable
-    if whole:
+    unfinished = frozenset(opened.sequence.numbers) - found.keys()
+    if not unfinished and not opened.unreadable:
         write_report(opened.sequence, order.folder, opened.denoiser, report)
         if opened.shot.settings.preview:
             _preview(order, opened, report.files)
@@ -286,16 +288,17 @@ def summarize(order: Order) -> Summary:
         joints,
         _pictures(order, records, described),
         tuple(warnings),
+        unfinished,
     )
 
 
 class _Writer:
     """Denoises frames, and records each as it is finished."""
 
-    def __init__(self, order: Order, opened: _Opened, journal: Journal, joint: int | None, left: set[int]) -> None:
-        self.order, self.opened, self.journal, self.joint, self.left = order, opened, journal, joint, left
-        self.keys = _Keys(opened, Digests())
-        self.report = new_report(opened.sequence, "")
+    def __init__(self, order: Order, keys: _Keys, journal: Journal, joint: int | None, left: set[int]) -> None:
+        self.order, self.keys, self.journal, self.joint, self.left = order, keys, journal, joint, left
+        self.opened = keys.opened
+        self.report = new_report(self.opened.sequence, "")
         self.small: Tensor | None = None
 
     def write(self, numbers: list[int]) -> None:
@@ -310,6 +313,7 @@ class _Writer:
             output_layer=settings.output_layer,
             unwritten=[number for number in numbers if number not in self.left],
             of=len(sequence),
+            on_read=self.keys.inputs,
             on_file=self.finished,
         )
 
@@ -351,7 +355,9 @@ def _opened(order: Order) -> _Opened:
         torch.set_num_threads(threads)
     sequence, unreadable = _open_what_opens(order.shot)
     settings, choice = order.shot.settings.chosen(sequence)
-    denoiser = _denoiser(replace(settings, frames=None))
+    # Digested first: if the file changes while it is read, the frames belong to a digest that no file has.
+    weights = _weights(settings)
+    denoiser = _denoiser(replace(settings, frames=None), *weights)
     denoiser.reset(frames=len(sequence))
     streams = len(sequence) > 1 and denoiser.has_history(sequence.buffers)
     overlap = frames_remembered(denoiser.model, order.joint) if streams else 0
@@ -359,14 +365,16 @@ def _opened(order: Order) -> _Opened:
     # References do not change a result.
     rows = [str(row) for row in sequence.table if row.buffer != "reference"]
     described = digest_text(
-        version("mcdenoise"), source_commit(), repr(sorted(listed.items())), *_weights(settings), *rows, str(overlap)
+        version("mcdenoise"), source_commit(), repr(sorted(listed.items())), *weights, *rows, str(overlap)
     )
-    shot = replace(order.shot, settings=settings)
-    return _Opened(shot, sequence, denoiser, overlap, unreadable, choice, described)
+    # After the scan the model is named, and the reason is that of the scan.
+    shot = replace(order.shot, settings=settings, picked=choice or order.shot.picked)
+    return _Opened(shot, sequence, denoiser, overlap, unreadable, described)
 
 
 @functools.lru_cache(1)
-def _denoiser(settings: Any) -> Denoiser:
+def _denoiser(settings: Any, *weights: str) -> Denoiser:
+    """The denoiser; the digests of its files are there for the cache."""
     denoiser: Denoiser = settings.denoiser()
     return denoiser
 
@@ -493,13 +501,7 @@ def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str
 
 def _preview(order: Order, opened: _Opened, files: Mapping[int, Path]) -> None:
     """Write the preview of `mcdenoise denoise --preview` from the files, whose frames were denoised in any order."""
-    settings = opened.shot.settings
-    shown = Preview(
-        order.folder,
-        video=len(files) > 1,
-        frames_per_second=settings.preview_fps,
-        exposure=settings.preview_exposure,
-    )
+    shown = opened.shot.settings.preview_in(order.folder, video=len(files) > 1)
     for path in files.values():
         image, metadata = open_result(path).read()
         shown.add(path.stem, image, metadata)

@@ -1,16 +1,51 @@
-"""Small shots, that a camera walks past a wall in, and films of them."""
+"""Small shots, that a camera walks past a wall in, films of them, and an engine that makes films in this process."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
-from mcdenoise.data.exr import read_exr
+from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
+from mcdenoise.engines import Done
+from mcdenoise.film import work
 from mcdenoise.frame import Frame
+
+
+class Inline:
+    """An engine that does every task at once, in this process, and loses those that ``lose`` selects."""
+
+    def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
+        self.done: dict[Hashable, Done] = {}
+        self.tasks: list[str] = []
+        self.lose = lose
+
+    def free_slots(self) -> int:
+        return 1
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+        self.tasks.append(function.__name__)
+        handle = len(self.tasks)
+        if self.lose(function.__name__, handle):
+            self.done[handle] = Done(lost="its process ended without a word")
+            return handle
+        try:
+            self.done[handle] = Done(function(*arguments))
+        except Exception as error:
+            self.done[handle] = Done(error=error)
+        return handle
+
+    def finished(self, seconds: float) -> dict[Hashable, Done]:
+        found, self.done = self.done, {}
+        return found
+
+    def close(self) -> None:
+        work._opened.cache_clear()
 
 
 def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:
@@ -68,6 +103,12 @@ def write_manifest(path: Path, shots: dict[str, Path], **every: object) -> Path:
 
 def _toml(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def edit(path: Path) -> None:
+    """Render a frame again: other pixels, in a file of the same size."""
+    image, channels, _ = read_exr(path)
+    write_exr(path, image * 1.5, channels, full_float=True)
 
 
 def pixels(folder: Path) -> dict[str, np.ndarray]:

@@ -6,54 +6,22 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from shots import pixels, same, write_manifest, write_shot
+from shots import Inline, edit, pixels, same, write_manifest, write_shot
 
 from mcdenoise.cli import main
-from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import held
-from mcdenoise.engines import Done, RayEngine
+from mcdenoise.engines import RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, FilmResult, read_film, run_film, work, write_page
+from mcdenoise.film import Film, FilmResult, read_film, run_film, write_page
 from mcdenoise.film.record import FrameRecord, read_records
 from mcdenoise.shot import ShotSettings
 
 MODEL = "accumulated"
-
-
-class Inline:
-    """An engine that does every task at once, in this process, and loses those that ``lose`` selects."""
-
-    def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
-        self.done: dict[Hashable, Done] = {}
-        self.tasks: list[str] = []
-        self.lose = lose
-
-    def free_slots(self) -> int:
-        return 1
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
-        self.tasks.append(function.__name__)
-        handle = len(self.tasks)
-        if self.lose(function.__name__, handle):
-            self.done[handle] = Done(lost="its process ended without a word")
-            return handle
-        try:
-            self.done[handle] = Done(function(*arguments))
-        except Exception as error:
-            self.done[handle] = Done(error=error)
-        return handle
-
-    def finished(self, seconds: float) -> dict[Hashable, Done]:
-        found, self.done = self.done, {}
-        return found
-
-    def close(self) -> None:
-        work._opened.cache_clear()
 
 
 @pytest.fixture
@@ -64,11 +32,6 @@ def shots(tmp_path: Path) -> dict[str, Path]:
 def run(shots: dict[str, Path], out: Path, engine: Inline | None = None, piece: int = 200, **every: Any) -> FilmResult:
     manifest = write_manifest(out.parent / "film.toml", shots, **{"model": MODEL, **every})
     return run_film(Film(read_film(manifest), out, piece), engine or Inline())
-
-
-def edit(path: Path) -> None:
-    image, channels, _ = read_exr(path)
-    write_exr(path, image * 1.5, channels, full_float=True)
 
 
 def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> None:
@@ -84,7 +47,7 @@ def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> 
             json.loads((each / "denoise.json").read_text()) for each in (tmp_path / "out" / name, tmp_path / name)
         )
         assert film.keys() == alone.keys()
-        for key in ("model", "sequence", "read", "warnings", "plan", "tiles", "precision"):
+        for key in ("model", "picked", "sequence", "read", "warnings", "plan", "tiles", "precision"):
             assert film[key] == alone[key], key
         for number, about in alone["frames"].items():
             own = film["frames"][number]
