@@ -19,9 +19,16 @@ from mcdenoise.data.exr import LARGEST_HALF, Image, Mask
 # Larger than any scene's depth; placeholders of renderers are larger still: 1e10 (Blender), 1e30, 3.4e38.
 _FARTHEST = 1e9
 _BLOCK = 8
+# Mean square contrast below which a block is uniform up to rounding and feature noise.
+_UNIFORM = 1e-4
 # Elasticities near 1 and near 0 are distinguished, although gloss and light between colored walls lower both (measured:
 # 0.47 to 1.17 and -0.53 to 0.19). The value must exceed this many standard errors, and errors must be below this limit.
 _THRESHOLD, _SIGMAS, _LARGEST_ERROR = 1 / 3, 3.0, 0.15
+# Edges of the color at those of the albedo must exceed this many standard errors, and an error of the part of them that
+# the albedo explains: in 1000 images whose color is blurred beyond any edge, 5 exceed both.
+_EDGES, _UNEXPLAINED = 2.5, 2.0
+# Offsets of the blocks in which edges are compared, and the largest number of all blocks.
+_OFFSETS, _MOST_BLOCKS = tuple(product((0, 2, 5, 7), (0, 3, 5, 6))), 2**18
 # One reading must be closer to the reference than the other by this factor.
 _NEARER = 1.5
 _LARGEST_MOTION = 1e5
@@ -71,6 +78,10 @@ class Albedo(NamedTuple):
 def albedo_included(color: Image, albedo: Image) -> Albedo:
     """Determine from a frame whether its radiance includes the albedo.
 
+    An elasticity near 0 proves nothing where the color lacks the edges of the albedo, because of a lens, fog or glass.
+    So radiance is without albedo only if it also has edges where the albedo has, which the albedo does not explain:
+    see :func:`_has_other_edges`.
+
     Two regressions over blocks of pixels are combined, both of them insensitive to noise: of the ratios of two channels
     (a path's noise is nearly the same in all three), and of the fourth root of the relative brightness (under which one
     path in a thousand that hits a lamp has the weight of ten others). The standard error is that of a jackknife over
@@ -95,7 +106,42 @@ def albedo_included(color: Image, albedo: Image) -> Albedo:
     slope = float(sum(w * value for w, (value, _) in zip(weights, found, strict=True) if w) / weights.sum())
     error = float(weights.sum() ** -0.5)
     told = abs(slope - _THRESHOLD) > _SIGMAS * error and error < _LARGEST_ERROR
-    return Albedo(slope > _THRESHOLD if told else None, slope, error)
+    included = slope > _THRESHOLD if told else None
+    if included is False and not _has_other_edges(albedo, color, usable):
+        included = None
+    return Albedo(included, slope, error)
+
+
+def _has_other_edges(albedo: Image, color: Image, usable: Mask) -> bool:
+    """Whether the color has edges at those of the albedo that do not follow the albedo, as light alone has.
+
+    In each block, with the relative deviations x of the albedo and y of the color from their means, ``c = sum(x y)`` is
+    split into the sums of both fields of a checkerboard of pixels, whose product is free of independent noise. The same
+    with mirrored x, which gradients give as well, is subtracted: the rest, q, is of edges that coincide. Of a sharp
+    image, however faint or partial, the albedo explains most edges: ``sum(c x x) > 2 sum(q) / 3``; of light, few.
+    """
+    fields = (np.add.outer(np.arange(_BLOCK), np.arange(_BLOCK)) % 2).astype(bool).ravel()
+    stripes = np.zeros((16, 2))
+    # Fewer blocks are enough for a large image.
+    offsets = _OFFSETS[: max(1, _MOST_BLOCKS * _BLOCK**2 // max(usable.size, 1))]
+    for (top, left), channel in product(offsets, range(3)):
+        inside = _blocks(usable[top:, left:])
+        x, y = (_blocks(np.where(usable, image[..., channel], 0)[top:, left:]) ** 0.25 for image in (albedo, color))
+        known = np.flatnonzero(inside.all(1) & (y.sum(1) > 0))
+        x, y = (each[known] / each[known].mean(1, keepdims=True) - 1 for each in (x, y))
+        x[(x**2).mean(1) < _UNIFORM] = 0
+        whole = x.reshape(-1, _BLOCK, _BLOCK)
+        q, contrast, *decoys = (
+            np.stack([image[:, fields].sum(1), image[:, ~fields].sum(1)])
+            for image in (x * y, x * x, *(np.flip(whole, axes).reshape(x.shape) * y for axes in (1, 2, (1, 2))))
+        )
+        scale = np.sqrt(contrast.prod(0)) + 1e-12
+        edges = (q.prod(0) - np.mean([each.prod(0) for each in decoys], 0)) / scale
+        explained = (q * contrast[::-1]).mean(0) / scale
+        np.add.at(stripes, known % 16, np.stack([edges, 2 / 3 * edges - explained], 1))
+    left_out = stripes.sum(0) - stripes
+    errors = np.sqrt(15 / 16 * ((left_out - left_out.mean(0)) ** 2).sum(0))
+    return bool((stripes.sum(0) > np.array([_EDGES, _UNEXPLAINED]) * errors).all())
 
 
 def albedo_included_as_in(reference: Image, color: Image, albedo: Image) -> bool | None:
@@ -115,13 +161,7 @@ def _distance(image: Image, reference: Image) -> float:
 
 def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Array:
     """``(N, 2)`` covariance and variance, summed over the blocks of each of N stripes."""
-    height, width = (size // _BLOCK * _BLOCK for size in x.shape)
-
-    def blocks(image: Image | Array) -> Array:
-        cut = np.where(usable, image, 0)[:height, :width].astype(np.float64)
-        return cut.reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK).swapaxes(1, 2).reshape(-1, _BLOCK**2)
-
-    inside, xs, ys = blocks(np.ones_like(x)), blocks(x), blocks(y)
+    inside, xs, ys = (_blocks(np.where(usable, image, 0)) for image in (np.ones_like(x), x, y))
     count = np.maximum(inside.sum(1, keepdims=True), 1)
     mean_x, mean_y = xs.sum(1, keepdims=True) / count, ys.sum(1, keepdims=True) / count
     if relative:
@@ -135,8 +175,15 @@ def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Arra
     dx, dy = np.where(within, xs - mean_x, 0), np.where(within, ys - mean_y, 0)
     pairs = np.stack([(dx * dy).sum(1), (dx * dx).sum(1)], 1)
     # Blocks that are uniform up to rounding and feature noise carry no information.
-    pairs[pairs[:, 1] < count[:, 0] * 1e-4] = 0
+    pairs[pairs[:, 1] < count[:, 0] * _UNIFORM] = 0
     return np.stack([pairs[k::16].sum(0) for k in range(16)])
+
+
+def _blocks(image: Image | Array | Mask) -> Array:
+    """``(N, 64)`` pixels of the whole blocks of an image ``(H, W)``."""
+    height, width = (size // _BLOCK for size in image.shape)
+    cut = image[: height * _BLOCK, : width * _BLOCK].reshape(height, _BLOCK, width, _BLOCK).swapaxes(1, 2)
+    return cut.reshape(-1, _BLOCK**2).astype(np.float64)
 
 
 def _jackknife(stripes: Array) -> tuple[float, float]:

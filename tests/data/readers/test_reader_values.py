@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from kornia.filters import gaussian_blur2d
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.values import (
@@ -47,7 +49,17 @@ def light(seed: int) -> Image:
     path = np.where(random.random((HEIGHT, WIDTH)) < 0.4, random.pareto(2.5, (HEIGHT, WIDTH)) * 2, 0.05)
     # The noise of a path is nearly the same in all channels.
     tint = 1 + 0.05 * random.standard_normal((HEIGHT, WIDTH, 3))
-    return (smooth * path)[..., None].astype(np.float32) * tint.clip(0.5, 1.5).astype(np.float32) * (1, 0.9, 0.8)
+    # Each check of the texture is in the light or in shadow.
+    shadow = random.choice([0.1, 1], (HEIGHT, WIDTH))[rows // 5 * 5, columns // 7 * 7]
+    lit = (smooth * path * shadow)[..., None].astype(np.float32)
+    return lit * tint.clip(0.5, 1.5).astype(np.float32) * (1, 0.9, 0.8)
+
+
+def blurred(image: Image, sigma: float) -> Image:
+    """The image through a lens of this blur in pixels."""
+    size = 2 * int(3 * sigma) + 1
+    lens = gaussian_blur2d(torch.from_numpy(image).movedim(-1, 0)[None], (size, size), (sigma, sigma))
+    return lens[0].movedim(0, -1).numpy()
 
 
 @pytest.mark.parametrize("kind", ["colored", "grey"])
@@ -60,9 +72,41 @@ def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) ->
     # Light grows with albedo by 1 or 0 percent for each percent, up to a few of its errors.
     assert with_it.elasticity == pytest.approx(1, abs=5 * with_it.error + 0.02)
     assert without.elasticity == pytest.approx(0, abs=5 * without.error + 0.02)
+    # Without edges in the light, a lens may have taken those of the albedo away.
+    assert albedo_included(blurred(irradiance.astype(np.float32), 3), albedo).included is not False
     # A frame of zeros and NaN in places says the same.
     spoilt = np.where(np.random.default_rng(seed).random((HEIGHT, WIDTH, 1)) < 0.02, np.nan, albedo * irradiance)
     assert albedo_included(spoilt, albedo).included is True
+
+
+@pytest.mark.parametrize("sigma", [2, 6, 12])
+@pytest.mark.parametrize("kind", ["colored", "grey"])
+def test_a_blurred_color_is_never_taken_for_light_without_albedo(kind: str, sigma: float) -> None:
+    albedo, random = texture(kind), np.random.default_rng(0)
+    through_lens = blurred(albedo, sigma)
+    for noise in (0, 1):
+        color = through_lens * (1 + noise * (random.gamma(2, 0.5, (HEIGHT, WIDTH, 1)) - 1)).astype(np.float32)
+        assert albedo_included(color, albedo).included is not False
+        included, _, warnings = read_radiance(color, albedo, None, None)
+        assert included is True
+        # If the texture is nearly gone, it is said that the color may be light alone.
+        assert bool(warnings) is (albedo_included(color, albedo).elasticity < 0.5)
+    # Blurred in the background and sharp in front, before which the light is another.
+    front = np.arange(WIDTH)[None, :, None] < WIDTH // 4
+    color = np.where(front, albedo * light(0), through_lens * light(1).mean())
+    assert albedo_included(color, albedo).included is not False
+
+
+@pytest.mark.parametrize("seen_through", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("kind", ["colored", "grey"])
+def test_fog_and_glass_are_never_taken_for_light_without_albedo(kind: str, seen_through: float) -> None:
+    albedo = texture(kind)
+    for seed in range(3):
+        irradiance = light(seed)
+        fog = seen_through * albedo * irradiance + (1 - seen_through) * 0.3
+        assert albedo_included(fog, albedo).included is not False
+        # A mirror image, which has other edges than the surface.
+        assert albedo_included(seen_through * albedo * irradiance + light(9)[::-1, ::-1], albedo).included is not False
 
 
 @pytest.mark.parametrize("included", [True, False])
