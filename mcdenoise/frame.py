@@ -642,9 +642,13 @@ def _illegal(spec: BufferSpec, value: Tensor) -> Tensor:
 
 
 def _refuse_illegal(name: str, count: int, place: str = "") -> None:
+    spec = _spec_of(name)
+    expected = "finite values or inf" if spec.infinite else "finite values"
+    advice = "set them to inf where there is none" if spec.infinite else "render the buffer again"
     raise InputError(
-        f"buffer '{name}': expected finite values ({_spec_of(name).meaning}), "
-        f"found {count} NaN or infinite ones{place}; render the buffer again or leave it out"
+        f"buffer '{name}': expected {expected} ({spec.meaning}), "
+        f"found {count} {'NaN or -inf' if spec.infinite else 'NaN or infinite'} ones{place}; "
+        f"{advice}, or leave the buffer out"
     )
 
 

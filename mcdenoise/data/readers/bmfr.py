@@ -170,6 +170,9 @@ class BmfrFolder:
                 matrix, distance = _view_depth(matrix, found["position"])
                 found.setdefault("depth", distance)
             found["view_projection"] = torch.from_numpy(matrix).float()[None]
+        if "position" in found:
+            # Where nothing was hit it may be infinite; the depth tells.
+            found["position"] = found["position"].where(found["position"].isfinite(), 0)
         if self.motion is None:
             found.pop("motion", None)
         elif "motion" in found and self.motion != USUAL_MOTION:
@@ -623,7 +626,7 @@ def _view_depth(matrix: Array, position: Tensor) -> tuple[Array, Tensor]:
     # Row by row, because a large image takes much memory in float64.
     w = torch.stack([row.double().T @ factors + matrix[3, 3] for row in position[0].unbind(1)])
     # A matrix and its negative give the same projection; visible points lie in front.
-    if w.median() < 0:
+    if w[w.isfinite()].median() < 0:
         matrix, w = -matrix, -w
     return matrix, w.float()[None, None]
 

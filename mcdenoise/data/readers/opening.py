@@ -368,7 +368,7 @@ def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention
         )
         pairs.append((features, earlier, images["motion"]))
     moved = any(np.nanmedian(np.linalg.norm(seen, axis=-1)) > _MOVED for _, seen in seen_elsewhere)
-    if moved and not any(motion.any() for *_, motion in pairs):
+    if moved and not any(given.moves(motion, 0) for *_, motion in pairs):
         del shot.choice.layers["motion"]
         shot.warnings.append(
             "'motion': all zeros although the camera moves, as Blender writes it with motion blur; positions are used "

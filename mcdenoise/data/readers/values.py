@@ -241,7 +241,7 @@ def normal_is_encoded(normal: Image) -> bool:
 
 def is_direction(vectors: Image) -> bool:
     """Whether most vectors have length one or zero."""
-    length = np.linalg.norm(np.nan_to_num(vectors), axis=-1)
+    length = np.linalg.norm(np.where(np.isfinite(vectors), vectors, 0), axis=-1)
     present = length > 1e-3
     return bool(present.any() and (np.abs(length[present] - 1) < 0.05).mean() > 0.9)
 
@@ -268,10 +268,22 @@ class Convention(NamedTuple):
 
     def apply(self, motion: Image) -> Image:
         """Convert to ``(H, W, 2)`` pixels, y down; infinite where the stored value is huge or NaN."""
-        scaled: Image = motion[..., :2] * np.array([self.scale_x, self.scale_y], np.float32)
-        with np.errstate(invalid="ignore"):
-            known = (np.abs(scaled) < _LARGEST_MOTION).all(-1, keepdims=True)
-        return np.where(known, scaled, np.float32(np.inf))
+        with np.errstate(invalid="ignore", over="ignore"):
+            scaled: Image = motion[..., :2] * np.array([self.scale_x, self.scale_y], np.float32)
+        return np.where(_is_known(scaled)[..., None], scaled, np.float32(np.inf))
+
+    def moves(self, motion: Image, least: float) -> int:
+        """The number of pixels that move more than this in x or y, of those with a motion."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            moved = np.abs(self.apply(motion)).max(-1)
+            return int(((moved > least) & (moved < np.inf)).sum())
+
+
+def _is_known(motion: Image) -> Mask:
+    """``(H, W)`` where a motion is neither infinite, as in a background, nor NaN, nor huge."""
+    with np.errstate(invalid="ignore"):
+        known: Mask = np.abs(motion[..., :2]).max(-1) < _LARGEST_MOTION
+    return known
 
 
 USUAL_MOTION = Convention(1, 1, "previous - current, y down, pixels")
@@ -332,7 +344,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     if not pairs:
         return given, False
     given, candidates = _candidates([motion for *_, motion in pairs], given)
-    moving = sum(int((np.abs(given.apply(m)).max(-1) > _MOVES).sum()) for *_, m in pairs)
+    moving = sum(given.moves(motion, _MOVES) for *_, motion in pairs)
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
@@ -343,7 +355,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     better = errors[best] < _BETTER * errors[given]
     # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
-        far = sum(int((np.abs(given.apply(m)).max(-1) > _FAR).sum()) for *_, m in pairs)
+        far = sum(given.moves(motion, _FAR) for *_, motion in pairs)
         contradicts = errors[best] > _CONTRADICTS * at_rest and far > _LEAST_MOVING
         return (None, True) if contradicts else (given, False)
     # If the usual unit gives hardly any motion and another unit matches, the motion is in that unit.
@@ -367,10 +379,11 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
 
     def missed(convention: Convention) -> float:
         moved = [
-            convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2]) for motion, _ in pairs
+            convention.apply(motion) if convention.scale_x else np.where(_is_known(motion)[..., None], 0, np.inf)
+            for motion, _ in pairs
         ]
         away = [np.linalg.norm(m - seen, axis=-1) for m, (_, seen) in zip(moved, pairs, strict=True)]
-        return float(np.mean([np.median(each[~np.isnan(each)]) if (~np.isnan(each)).any() else 0 for each in away]))
+        return float(np.mean([np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 0 for each in away]))
 
     errors = {each: missed(each) for each in candidates}
     best = min(errors, key=lambda each: errors[each])
@@ -390,15 +403,16 @@ def _candidates(motions: Sequence[Image], given: Convention) -> tuple[Convention
 def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Image, convention: Convention) -> float:
     """Mean difference of features and of the previous features to which a motion leads.
 
-    A pixel led outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a
-    motion that leads every pixel outside is rejected.
+    Only pixels with a motion are compared, so that a background without one is no argument for rest. A pixel led
+    outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a motion that
+    leads every pixel outside is rejected.
     """
     moved = convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2])
     height, width = moved.shape[:2]
     rows, columns = np.mgrid[:height, :width]
     x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
     y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
-    known = np.isfinite(x) & np.isfinite(y)
+    known = np.isfinite(x) & np.isfinite(y) & _is_known(motion)
     grid = torch.from_numpy(np.stack([np.where(known, x, 0), np.where(known, y, 0)], -1)).float()[None]
     inside = known & (np.abs(x) <= 1) & (np.abs(y) <= 1)
     total = 0.0
@@ -406,5 +420,5 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
         source = torch.from_numpy(before[name]).permute(2, 0, 1)[None]
         found = F.grid_sample(source, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0).numpy()
         error, at_rest = (np.minimum(np.abs(each - image).mean(-1), 1) for each in (found, before[name]))
-        total += float(np.where(inside, error, 2 * at_rest.mean())[known].mean()) if known.any() else 1.0
+        total += float(np.where(inside, error, 2 * at_rest[known].mean())[known].mean()) if known.any() else 1.0
     return total

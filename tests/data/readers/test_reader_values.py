@@ -298,6 +298,62 @@ def test_motion_that_contradicts_the_frames_is_not_used() -> None:
     assert match_cameras([(stored, np.full(stored.shape, 4.0))], USUAL_MOTION) is None
 
 
+@pytest.mark.parametrize("horizon", [12, 30, 50])
+@pytest.mark.parametrize("nothing", [np.inf, -np.inf, np.nan, 1e10])
+def test_motion_is_compared_where_there_is_one(nothing: float, horizon: int) -> None:
+    """A camera that moves over a floor: the sky above has no motion, and matches itself at rest."""
+    now, before = moving(SHIFT)
+    for image in (now["albedo"], before["albedo"]):
+        image[:horizon] = 0
+    for signs in ((1, 1), (-1, 1), (-1, -1)):
+        stored = np.array(SHIFT * np.ones((60, 100, 2)) * signs, np.float32)
+        stored[:horizon] = nothing
+        assert match_motion([(now, before, stored)], USUAL_MOTION)[0][:2] == signs
+        seen = np.full(stored.shape, SHIFT, np.float64)
+        seen[:horizon] = np.nan
+        assert match_cameras([(stored, seen)], USUAL_MOTION)[:2] == signs
+    # Motion of few pixels tells nothing, and wrong motion is found out under any sky.
+    few = np.full(stored.shape, nothing, np.float32)
+    assert match_motion([(now, before, few)], USUAL_MOTION) == (USUAL_MOTION, False)
+    stored[horizon:] = np.random.default_rng(0).uniform(-20, 20, stored[horizon:].shape)
+    assert match_motion([(now, now, stored)], USUAL_MOTION) == (None, True)
+
+
+@pytest.mark.parametrize("layout", ["files", "bmfr"])
+def test_a_moving_camera_under_an_infinite_sky(
+    layout: str, others: Any, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    for number in (1, 2, 3):
+        truth = others.read(number)
+        hit = truth["hit"]
+        buffers = {
+            "color": ("RGB", truth["color"]),
+            "albedo": ("RGB", truth["albedo"]),
+            "shading_normal": ("XYZ", truth["normal"]),
+            "depth": ("Y" if layout == "bmfr" else "Z", np.where(hit, truth["depth"], np.inf)[..., None]),
+            "motion": ("XY", np.where(hit[..., None], truth["motion"], np.inf)),
+            "world_position": ("XYZ", np.where(hit[..., None], truth["position"], np.inf)),
+        }
+        channels = {n: {each: image[..., i] for i, each in enumerate(names)} for n, (names, image) in buffers.items()}
+        if layout == "bmfr":
+            for name, own in channels.items():
+                save(tmp_path / f"{name}{number}.exr", own)
+        else:
+            layers = {f"{name}.{each}": image for name, own in channels.items() for each, image in own.items()}
+            save(tmp_path / f"shot_{number}.exr", layers)
+    sequence = open_sequence(tmp_path)
+    assert sequence.layout == layout
+    assert list(sequence.warnings) == []
+    assert {"motion", "depth"} <= sequence.buffers
+    for number in (2, 3):
+        frame, truth = sequence.frame(number), others.read(number)
+        frame.validate()
+        hit = torch.from_numpy(truth["hit"])
+        motion = torch.from_numpy(truth["motion"].astype(np.float32)).movedim(-1, 0)
+        torch.testing.assert_close(frame.motion[0, :, hit], motion[:, hit])
+        assert frame.depth[0, 0, ~hit].isinf().all()
+
+
 @pytest.mark.parametrize("contrast", [0.05, 1.0])
 @pytest.mark.parametrize("pan", [(32.0, 4.0), (-20.0, 15.0)])
 def test_a_fast_pan_is_no_contradiction(pan: tuple[float, float], contrast: float) -> None:
