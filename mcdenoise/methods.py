@@ -12,7 +12,7 @@ from typing import Any
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.models import describe_weights, find_model
+from mcdenoise.models import find_model, model_of
 
 WEIGHTS = ".safetensors"
 # A name or path, optionally followed by settings in parentheses.
@@ -63,11 +63,13 @@ def parse_method(text: str) -> Spelling:
     """Parse a method.
 
     Args:
-        text: such as ``"cascaded_v2(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/mine.safetensors"`` or
-            ``"mine.py:make"``. Values are numbers, ``True``, ``False``, ``None``, or unquoted strings.
+        text: such as ``"cascaded_v2(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/cascaded_v2.safetensors"``,
+            ``"mine.py:make"`` or, with weights, ``"mine.py:make(weights=run/make.safetensors)"``. Values are numbers,
+            ``True``, ``False``, ``None``, or unquoted strings.
 
     Raises:
-        InputError: the text has another form, or a weights file cannot be read.
+        InputError: the text has another form, or a weights file that is named alone cannot be read, or is for a model
+            that is not registered.
 
     Example:
         >>> parse_method("joint_bilateral(sigma_color=0.1, sigma_space=4)").settings
@@ -85,10 +87,26 @@ def parse_method(text: str) -> Spelling:
         setting, equals, value = (each.strip() for each in part.partition("="))
         if not (setting.isidentifier() and equals and value) or setting in settings:
             raise InputError(f"method '{text}': expected settings such as (setting=value), found '{part.strip()}'")
-        settings[setting] = _value(value)
+        settings[setting] = value if setting == "weights" else _value(value)
     if not name.endswith(WEIGHTS):
-        return Spelling(name, None, settings)
-    return Spelling(str(describe_weights(Path(name))["architecture"]), Path(name), settings)
+        weights = settings.pop("weights", None)
+        return Spelling(name, weights if weights is None else Path(weights), settings)
+    return Spelling(model_of(Path(name)), Path(name), settings)
+
+
+def check_names_no_code(text: str, where: str) -> None:
+    """Check that a method, which a file names, is a model of the zoo or a weights file, and no code of a user.
+
+    Raises:
+        InputError: it names a factory.
+    """
+    match = _SPELLING.fullmatch(text.strip())
+    name = "" if match is None else match["name"].strip()
+    if ":" in name and not name.endswith(WEIGHTS):
+        raise InputError(
+            f"{where}: expected a model that `mcdenoise models` lists, or a weights file, found '{name}'; a file names "
+            "no code to run: leave it out, and name your own model on the command line (--model)"
+        )
 
 
 def split_methods(text: str) -> list[str]:

@@ -14,7 +14,7 @@ from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
-from mcdenoise.models import DEFAULT, describe_weights
+from mcdenoise.models import DEFAULT, model_of
 
 if TYPE_CHECKING:
     from mcdenoise.preview import Preview
@@ -190,7 +190,7 @@ class ShotSettings:
         if self.weights is None:
             return parse_method(self.model or DEFAULT)
         if self.model is None:
-            return Spelling(str(describe_weights(self.weights)["architecture"]), self.weights)
+            return Spelling(model_of(self.weights), self.weights)
         return replace(parse_method(self.model), weights=self.weights)
 
     def denoiser(self) -> Denoiser:

@@ -13,6 +13,7 @@ from mcdenoise.cli._output import say, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.export import Format, default_buffers, differences, export_model
+from mcdenoise.methods import parse_method
 from mcdenoise.models import create_model
 
 
@@ -32,7 +33,8 @@ def export(
     the outputs are image and next_state.NAME. An export takes some minutes.
 
     Args:
-        model: name of a model, see `mcdenoise models`, or your own: path/to/file.py:factory or package.module:factory.
+        model: name of a model, see `mcdenoise models`, optionally with settings; a weights file; or your own:
+            path/to/file.py:factory or package.module:factory.
         out: file to write, .onnx or .pt2.
         weights: safetensors file with your own weights for that model.
         buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
@@ -42,7 +44,9 @@ def export(
         frames: number of frames to check.
         json: write the names of inputs and outputs, and the differences, to this file too.
     """
-    made = create_model(model, pretrained=weights is None, weights=weights)
+    spelling = parse_method(model)
+    weights = spelling.weights if weights is None else weights
+    made = create_model(spelling.model, pretrained=weights is None, weights=weights, **spelling.settings)
     sequence = None if check is None else open_sequence(check)
     if sequence is not None and (format == "torch" or out.suffix == ".pt2"):
         raise InputError("--check: expected an ONNX file, for onnxruntime, found another format")

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError, is_unicode, printable
-from mcdenoise.methods import WEIGHTS
+from mcdenoise.methods import WEIGHTS, check_names_no_code
 from mcdenoise.reading import read_text
 from mcdenoise.shot import ShotSettings
 
@@ -49,8 +49,9 @@ def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot
     Args:
         manifest: a TOML file with a table ``[[shot]]`` for each shot, which has ``name``, ``input`` (a folder, a file,
             a pattern, or a list of these, beside the manifest where they are not absolute), and any setting of
-            :class:`mcdenoise.shot.ShotSettings`; a table ``[every]`` has settings of all shots. Or a pattern of folders
-            such as ``renders/*/beauty``: each folder is a shot, and is named by the parts that match wildcards.
+            :class:`mcdenoise.shot.ShotSettings`, but no model of one's own, which is code and named by ``settings``; a
+            table ``[every]`` has settings of all shots. Or a pattern of folders such as ``renders/*/beauty``: each
+            folder is a shot, and is named by the parts that match wildcards.
         settings: of all shots; the manifest overrides them.
 
     Raises:
@@ -145,6 +146,8 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
             meant = f"did you mean '{near[0]}'?" if near else "see `mcdenoise denoise --help`"
             raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{key}'; {meant}")
         changed[name] = _typed(kinds[name], value, f"{where}, {key}")
+        if name == "model":
+            check_names_no_code(value, f"{where}, {key}")
     made = _absolute(replace(settings, **changed), base, changed)
     try:
         made.check()

@@ -18,7 +18,7 @@ from torch import nn
 
 from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.models._adapter import as_model
-from mcdenoise.models._defaults import plain_defaults
+from mcdenoise.models._defaults import outlined, plain_defaults
 from mcdenoise.models._interface import Model
 from mcdenoise.own import in_one_line, load_own
 
@@ -54,6 +54,11 @@ class Entry:
     def installed(self) -> bool:
         """Whether the required package is installed."""
         return not self.requires or importlib.util.find_spec(self.requires) is not None
+
+    @property
+    def of_zoo(self) -> bool:
+        """Whether it is a model of this package."""
+        return str(getattr(self.construct, "__module__", "")).startswith("mcdenoise.models.")
 
     @property
     def architecture(self) -> dict[str, Any]:
@@ -104,6 +109,12 @@ def list_models(pattern: str = "*") -> list[str]:
     return sorted(name for name in {*_MODELS, *_installed()} if fnmatch(name, pattern))
 
 
+def is_registered(name: str) -> bool:
+    """Whether a name is that of a registered model, without importing code that a name could point to."""
+    _import_pages()
+    return name in _MODELS or name in _installed()
+
+
 def find_model(name: str) -> Entry:
     """The entry of a registered model, of one that an installed package offers, or of a user's own model.
 
@@ -144,6 +155,12 @@ def build_model(name: str, **settings: Any) -> Model:
         InputError: there is no such model, or it has no such setting.
     """
     with plain_defaults():
+        return _build_model(name, settings)
+
+
+def outline_model(name: str, settings: dict[str, Any]) -> Model:
+    """A model of the zoo whose tensors have shapes and take no memory; see :func:`build_model` for the errors."""
+    with outlined():
         return _build_model(name, settings)
 
 

@@ -6,6 +6,8 @@ import hashlib
 import inspect
 import json
 import operator
+import reprlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,16 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
-from mcdenoise.models._registry import build_model, find_model
+from mcdenoise.models._registry import Entry, build_model, find_model, is_registered, outline_model
 from mcdenoise.nn import UNet
 from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"
 # Folder of weights for comparisons: all methods were trained with the same short recipe.
 _COMPARED = _SHIPPED / "compared"
+# The largest number in a header's settings: of a model of the zoo, whose constructors repeat layers, and of any other.
+_LARGEST, _LARGEST_OF_OWN = 1 << 12, 1 << 24
+_LONGEST = 200
 
 
 def create_model(name: str, *, pretrained: bool = False, weights: Path | str | None = None, **settings: Any) -> Model:
@@ -74,58 +79,124 @@ def compared_models() -> list[str]:
 def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     """Load the model that a weights file describes.
 
+    Only registered models are made from a file alone: a file names no code that is imported or called.
+
     Args:
         path: a file written by :func:`save_weights`.
-        name: registered model that the file must hold, or a user's own model to load it into; by default the model that
-            the file names.
+        name: registered model that the file must hold, or a user's own model to load it into; by default the registered
+            model that the file names.
         settings: arguments for the model's constructor; those of a registered model that determine the weights must be
             as in the file.
 
     Raises:
-        InputError: the file does not exist, is not safetensors, holds another model, has tensors that do not fit (the
-            message names the first one), or has weights that are not finite; or the model has no such setting.
+        InputError: the file does not exist, is not safetensors, holds another model or, without ``name``, a user's own,
+            has other settings than the model or settings out of range, has tensors that do not fit (the message names
+            the first one), or has weights that are not finite; or the model has no such setting.
     """
     description = describe_weights(path)
     found = description["architecture"]
-    if name is not None and found != name and ":" not in name:
+    if name is None:
+        name = model_of(path)
+    elif found != name and ":" not in name:
         raise InputError(f"{path}: expected weights of model '{name}', found those of '{found}'")
+    entry, own = find_model(name), ":" in name
+    _check_header(path, entry, description["settings"], found)
+    if not own:
+        _check_settings(name, settings, description["settings"])
     # The settings come from the file, so that a change of defaults in the code cannot change what a file means.
-    if lacking := sorted(set(find_model(name or found).architecture) - set(description["settings"])):
-        raise InputError(
-            f"{path}: header 'settings': expected every setting of model '{found}', found no {', '.join(lacking)}; "
-            "save the weights again"
-        )
-    if ":" not in (name or found):
-        _check_settings(found, settings, description["settings"])
-    try:
-        model = build_model(name or found, **{**description["settings"], **settings})
-    except (TypeError, ValueError, RuntimeError) as error:
-        # Settings that are given are not the file's mistake.
-        where, given = ("", settings) if settings else (f"{path}: ", description["settings"])
-        reason = str(error) if isinstance(error, InputError) else f"expected settings of model '{found}', found {given}"
-        raise InputError(f"{where}{reason}") from error
+    every = {**description["settings"], **settings}
     with safe_open(path, framework="pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - a safetensors handle is no dict
+        shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118 - it is no dict
+        try:
+            if entry.of_zoo and description["settings"] != entry.architecture:
+                # Shapes are compared before memory is taken, of which a header can ask for any amount.
+                _check_shapes(path, found, _shapes(outline_model(name, every), shapes), shapes)
+            model = build_model(name, **every)
+        except (TypeError, ValueError, RuntimeError, ArithmeticError, LookupError, MemoryError) as error:
+            if isinstance(error, InputError) and str(error).startswith(f"{path}: "):
+                raise
+            # Settings that are given are not the file's mistake.
+            where, given = ("", settings) if settings else (f"{path}: ", description["settings"])
+            reason = (
+                str(error) if isinstance(error, InputError) else f"expected settings of model '{found}', found {given}"
+            )
+            raise InputError(f"{where}{reason}") from error
+        _check_shapes(path, found, _shapes(model, shapes), shapes)
+        tensors = {key: file.get_tensor(key) for key in shapes}
+    if description.get("sha256") != _digest(tensors):
+        raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
     for name, unet in _unets(model).items():
         # Only a calibrated network has ranges.
         if (ranges := tensors.get(f"{name}.ranges")) is not None:
             unet.ranges = torch.zeros(ranges.shape)
-    own = _named(model)
-    for key in sorted(own.keys() | tensors.keys()):
-        expected = tuple(own[key].shape) if key in own else "no such layer"
-        actual = tuple(tensors[key].shape) if key in tensors else "no such layer"
-        if expected != actual:
-            raise InputError(f"{path}: layer '{key}': model '{found}' expects {expected}, found {actual}")
-    if description.get("sha256") != _digest(tensors):
-        raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
+    weights = _named(model)
     for key, tensor in tensors.items():
-        if own[key].is_floating_point() and not tensor.is_floating_point():
+        if weights[key].is_floating_point() and not tensor.is_floating_point():
             raise InputError(f"{path}: layer '{key}': expected floating-point weights, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise InputError(f"{path}: layer '{key}': expected finite weights, found NaN or infinite ones")
         with torch.no_grad():
-            own[key].copy_(tensor)
+            weights[key].copy_(tensor)
     return model.eval() if isinstance(model, nn.Module) else model
+
+
+def model_of(path: Path) -> str:
+    """The name of the registered model that a weights file is for.
+
+    Raises:
+        InputError: the file was not written by :func:`save_weights`, or it is for a model of the user, which only the
+            caller can name.
+    """
+    found = str(describe_weights(path)["architecture"])
+    if is_registered(found):
+        return found
+    if ":" in found:
+        raise InputError(
+            f"{path}: expected weights of a model that `mcdenoise models` lists, found those of a user's own, "
+            f"'{found}'; a file names no code to run, so name the model yourself: 'path/to/file.py:factory(weights="
+            f"{path})', or in Python load_weights(path, 'path/to/file.py:factory')"
+        )
+    raise InputError(f"{path}: expected weights of a model that `mcdenoise models` lists, found those of '{found}'")
+
+
+def _shapes(model: Model, found: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
+    """The shapes of a model's weights, with the ranges of those U-Nets for which ranges were found."""
+    ranges = {key: found[key] for name in _unets(model) if (key := f"{name}.ranges") in found}
+    return {key: tuple(tensor.shape) for key, tensor in _named(model).items()} | ranges
+
+
+def _check_shapes(
+    path: Path, model: str, own: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]]
+) -> None:
+    for key in sorted(own.keys() | found.keys()):
+        expected, actual = own.get(key, "no such layer"), found.get(key, "no such layer")
+        if expected != actual:
+            raise InputError(f"{path}: layer '{key}': model '{model}' expects {expected}, found {actual}")
+
+
+def _check_header(path: Path, entry: Entry, settings: dict[str, Any], model: str) -> None:
+    """Raise ``InputError`` unless the settings of a header are those of the model, and plain values in range."""
+    where, known = f"{path}: header 'settings':", entry.architecture
+    if lacking := sorted(known.keys() - settings.keys()):
+        raise InputError(
+            f"{where} expected every setting of model '{model}', found no {', '.join(lacking)}; save the weights again"
+        )
+    if wrong := sorted(settings.keys() - known.keys()):
+        expected = ", ".join(known) or "none"
+        raise InputError(f"{where} expected settings of model '{model}' ({expected}), found '{wrong[0]}'")
+    largest = _LARGEST if entry.of_zoo else _LARGEST_OF_OWN
+    for name, value in settings.items():
+        if not all(_is_plain(each, largest) for each in (value if isinstance(value, list) else [value])):
+            raise InputError(
+                f"{where} expected for '{name}' true, false, null, a short text or a number of at most {largest}, "
+                f"found {reprlib.repr(value)}"
+            )
+
+
+def _is_plain(value: object, largest: int) -> bool:
+    # NaN is in no range.
+    number = isinstance(value, int | float) and abs(value) <= largest
+    return value is None or number or (isinstance(value, str) and len(value) <= _LONGEST)
 
 
 def _check_settings(name: str, given: dict[str, Any], fixed: dict[str, Any]) -> None:
@@ -219,7 +290,7 @@ def save_weights(model: Model, architecture: str, settings: dict[str, Any], abou
 
     Args:
         model: the model.
-        architecture: the registered name.
+        architecture: the registered name, or that of a user's own model, of which the file has no folders.
         settings: arguments given to the constructor in addition to the registered ones. The file holds every setting
             that determines the weights, so that a change of defaults in the code cannot change what a file means.
         about: provenance as texts: config, data, steps, commit, licence.
@@ -235,6 +306,10 @@ def save_weights(model: Model, architecture: str, settings: dict[str, Any], abou
         if not tensor.isfinite().all():
             raise InputError(f"layer '{key}': expected weights that fit half precision, found NaN or infinite ones")
     known = find_model(architecture).architecture
+    if ":" in architecture:
+        # For people to read only: the folder says nothing elsewhere.
+        place, _, factory = architecture.rpartition(":")
+        architecture = f"{Path(place).name}:{factory}"
     every = json.dumps({**known, **{name: value for name, value in settings.items() if name in known}})
     return save(tensors, {"architecture": architecture, "settings": every, **about, "sha256": _digest(tensors)})
 

@@ -31,6 +31,7 @@ The authors' loss is ``[train] loss = "rae"`` (:func:`mcdenoise.train.losses.rae
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -101,7 +102,7 @@ class Rae(nn.Module):
             for coarse, skip, middle, out in zip(coarser, widths[::-1], inside, leaving, strict=True)
         )
         last = self.decoder[-1][-1].bias
-        nn.init.constant_(last, torch.log1p(torch.tensor(_TYPICAL)).item())  # type: ignore[arg-type]
+        nn.init.constant_(last, math.log1p(_TYPICAL))  # type: ignore[arg-type]
 
     @property
     def persistence(self) -> None:

@@ -27,6 +27,7 @@ from typing import Any
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
+from mcdenoise.methods import check_names_no_code
 from mcdenoise.models import create_model
 from mcdenoise.reading import read_text
 from mcdenoise.train.cache import locked
@@ -38,7 +39,9 @@ _BOUND = {"smape": float, "tolerance": float}
 _CLEAN = "clean_references"
 # A run's name is also the name of its folder.
 _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
-_NO_PIXELS = ("workers", "ray", "threads", "blender_python")
+_NO_PIXELS = ("workers", "threads")
+# A file names neither a program to run nor a machine to connect to.
+_OF_CALLERS = {"ray", "blender_python"}
 # Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
 _FIRST_NAMES = {"noise_seeds": "realisations"}
 
@@ -157,6 +160,8 @@ class Recipe:
             sha256 = _digest([settings or None, *rendered])
             config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
             with naming(where):
+                for key in ("model", "start_from"):
+                    check_names_no_code(getattr(config, key), key)
                 # Check settings before hours of rendering.
                 check_config(config, 1)
                 create_model(config.model, **config.model_settings)
@@ -242,7 +247,7 @@ def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) ->
     made = []
     for number, table in enumerate(tables, start=1):
         where = f"{path}: [[{name}]] {number}"
-        _check_keys(where, table, [*options, _CLEAN])
+        _check_keys(where, table, {*options, _CLEAN} - _OF_CALLERS)
         clean = _checked(where, {_CLEAN: table.get(_CLEAN, False)}, {_CLEAN: bool})[_CLEAN]
         made.append(Rendering(where, {key: value for key, value in table.items() if key != _CLEAN}, clean))
     return made

@@ -52,9 +52,21 @@ def test_a_manifest_says_what_to_denoise_and_how(tmp_path: Path) -> None:
     assert second.settings.anti_lag is False
 
 
-def test_a_users_model_is_found_beside_the_manifest(tmp_path: Path) -> None:
-    text = '[[shot]]\nname="a"\ninput="b"\nmodel="mine.py:make(gain=2)"'
-    assert read_film(write(tmp_path, text))[0].settings.model == f"{tmp_path}/mine.py:make(gain=2)"
+def test_a_users_model_is_named_by_the_caller_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = '[[shot]]\nname="a"\ninput="b"\n'
+    (shot,) = read_film(write(tmp_path, text), ShotSettings("mine.py:make(gain=2)"))
+    assert shot.settings.model == f"{tmp_path}/mine.py:make(gain=2)"
+    for model in (
+        "mine.py:make",
+        "os:system(command=ls)",
+        "a(1)/mine.py:make",
+        " os:system",
+        "os:x.safetensors(y=1)/m:f",
+    ):
+        for manifest in (f'{text}model="{model}"', f'{text}[every]\nmodel="{model}"'):
+            with pytest.raises(InputError, match="a file names no code"):
+                read_film(write(tmp_path, manifest))
 
 
 def test_a_pattern_names_shots_by_what_it_leaves_open(tmp_path: Path) -> None:

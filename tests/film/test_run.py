@@ -231,7 +231,9 @@ def test_a_model_that_fails_is_no_fault_of_the_film(shots: dict[str, Path], tmp_
     (tmp_path / "mine.py").write_text(
         "def make():\n    def own(color):\n        raise ArithmeticError('no way')\n    return own\n"
     )
-    result = run(shots, tmp_path / "out", model="mine.py:make")
+    manifest = write_manifest(tmp_path / "film.toml", shots)
+    settings = ShotSettings(f"{tmp_path}/mine.py:make")
+    result = run_film(Film(read_film(manifest, settings), tmp_path / "out"), Inline())
     assert result.shots[0].failures() == [("0 to 3 (4)", "ArithmeticError: no way")]
     assert "mine.py" in result.shots[0].traces[0]
 

@@ -173,7 +173,7 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         (
             '[[data]]\nseeds = "0-1"',
             '[[data]]\nseed = "0-1"',
-            "[[data]] 1: unknown key 'seed'; known are blender_p",
+            "[[data]] 1: unknown key 'seed'; known are ",
         ),
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),
         ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),

@@ -1,0 +1,129 @@
+"""Code that a file, a folder or a package brings along: it runs only where the caller names it, and breaks nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from mcdenoise.cli import main
+from mcdenoise.errors import InputError
+from mcdenoise.models import create_model, describe_weights, load_weights, save_weights
+
+# Calls that a header may ask for, with {touched} for a file that they would make.
+HOSTILE = {
+    "os:system": {"command": "touch {touched}"},
+    "subprocess:run": {"args": "touch {touched}", "shell": True},
+    "builtins:exec": {"source": "open('{touched}', 'w')"},
+    "beside.py:make": {},
+    "beside:make": {},
+    " os:system": {"command": "touch {touched}"},
+}
+LINES = (
+    "denoise {shot} -o out --weights {file}",
+    "denoise {shot} -o out --model {file}",
+    "evaluate {shot} --model {file}",
+    "benchmark {shot} -o out --models {file}",
+    "calibrate {file} {shot} -o out.safetensors",
+    "export {file} -o out.pt2",
+    "film film.toml -o out",
+)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working folder, with a module whose import leaves a file."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "beside.py").write_text(
+        f"open({str(tmp_path / 'touched')!r}, 'w')\n\n\ndef make():\n    return lambda color: color\n"
+    )
+    return tmp_path
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[[str], tuple[int, str]]:
+    """Run a command in this process: exit status and stderr."""
+
+    def call(line: str) -> tuple[int, str]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as stop:
+            main(line.split())
+        return int(stop.value.code or 0), capsys.readouterr().err
+
+    return call
+
+
+def write(path: Path, architecture: str, settings: dict[str, Any]) -> Path:
+    save_file({"a": torch.zeros(1)}, path, {"architecture": architecture, "settings": json.dumps(settings)})
+    return path
+
+
+@pytest.mark.parametrize("architecture", HOSTILE)
+def test_a_weights_file_names_no_code(
+    architecture: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
+) -> None:
+    settings = {
+        key: value.format(touched=here / "touched") if isinstance(value, str) else value
+        for key, value in HOSTILE[architecture].items()
+    }
+    file = write(here / "hostile.safetensors", architecture, settings)
+    with pytest.raises(InputError, match="name the model yourself"):
+        load_weights(file)
+    (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "{small_sequence}"\nmodel = "{file}"\n')
+    for line in LINES:
+        status, said = run(line.format(shot=small_sequence, file=file))
+        assert not (here / "touched").exists(), line
+        assert status == 2, (line, said)
+        assert "Traceback" not in said
+    assert not (here / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize("model", ["os:system(command=touch touched)", "beside.py:make", "beside:make"])
+@pytest.mark.parametrize("key", ["model", "start_from"])
+def test_a_recipe_and_a_manifest_name_no_code(
+    model: str, key: str, here: Path, run: Callable[[str], tuple[int, str]]
+) -> None:
+    (here / "recipe.toml").write_text(f'[train]\n{key} = "{model}"\nsteps = 1\n[[data]]\nseeds = "0"\n')
+    (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "shot"\nmodel = "{model}"\n')
+    for line in ("train --recipe recipe.toml -o out", "sweep recipe.toml -o out", "film film.toml -o out"):
+        status, said = run(line)
+        assert (status, len(said.splitlines())) == (2, 1), said
+        assert not (here / "touched").exists()
+        assert not (here / "out").exists()
+
+
+@pytest.mark.parametrize("key", ["blender_python", "ray"])
+def test_a_recipe_names_no_program_and_no_machine(key: str, here: Path, run: Callable[[str], tuple[int, str]]) -> None:
+    (here / "recipe.toml").write_text(f'[train]\nsteps = 1\n[[data]]\nseeds = "0"\n{key} = "/bin/true"\n')
+    status, said = run("train --recipe recipe.toml -o out")
+    assert status == 2
+    assert key in said
+
+
+def test_weights_of_ones_own_model_are_loaded_with_its_factory(
+    here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
+) -> None:
+    (here / "folder").mkdir()
+    (here / "folder/own.py").write_text(
+        "from mcdenoise.models import create_model\n\n\ndef make(width=4):\n"
+        "    return create_model('cascaded_v2_micro', width=width)\n"
+    )
+    name = f"{here}/folder/own.py:make"
+    file = here / "make.safetensors"
+    file.write_bytes(save_weights(create_model(name), name, {}, {}))
+    # Somebody else's folders are neither of use nor of interest.
+    assert describe_weights(file)["architecture"] == "own.py:make"
+    with pytest.raises(InputError, match="name the model yourself"):
+        load_weights(file)
+    saved = {key: value.half() for key, value in create_model(name, weights=file).state_dict().items()}
+    assert saved.keys() == load_weights(file, name).state_dict().keys()
+    assert run(f"denoise {small_sequence} -o denoised --model {name} --weights {file}")[0] == 0
+    assert run(f"evaluate {small_sequence} --model {name}(weights={file})")[0] == 0
+    assert run(f"calibrate {name}(weights={file}) {small_sequence} -o calibrated.safetensors")[0] == 0
+    assert describe_weights(here / "calibrated.safetensors")["architecture"] == "own.py:make"
