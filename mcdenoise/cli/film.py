@@ -59,7 +59,7 @@ def film(
         engine, threads = RayEngine(ray, cpus=cpus, gpus=float(gpus)), cpus
     else:
         workers = 1 if workers is None else workers
-        engine = LocalEngine(workers, preload="mcdenoise.film.work")
+        engine = LocalEngine(workers)
         threads = max(1, processors() // workers) if workers > 1 else None
     plan = Film(shots, out, piece, joint, threads)
     began = time.perf_counter()

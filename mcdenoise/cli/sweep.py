@@ -109,7 +109,7 @@ def sweep(
         ]
         engine: Engine
         if ray is None:
-            engine = LocalEngine(workers, preload="mcdenoise.cli.sweep")
+            engine = LocalEngine(workers)
         else:
             engine = RayEngine(ray, cpus=threads, gpus=float(accelerator == "cuda"))
         return _train(jobs, engine, out)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
-import sys
 from collections.abc import Callable, Hashable
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from mcdenoise.engines.engine import Done
+from mcdenoise.engines.engine import Done, describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
 
@@ -26,75 +26,94 @@ def processors() -> int:
 class LocalEngine:
     """Worker processes of this machine.
 
-    Each worker is a process pool of its own, because a killed worker breaks its pool.
+    Each has a pipe of its own, and shares no lock, server or queue with others: one that is killed is lost alone.
 
     Args:
         workers: number of processes, at least 1.
-        preload: module that workers have imported when they start.
 
     Raises:
         InputError: ``workers`` is less than 1.
     """
 
-    def __init__(self, workers: int, preload: str = "torch") -> None:
+    def __init__(self, workers: int) -> None:
         if workers < 1:
             raise InputError(f"--workers: expected at least 1, found {workers}")
-        # Forks of a process that has imported the module, and does nothing else, start at once.
-        forks = sys.platform.startswith("linux")
-        self._context = multiprocessing.get_context("forkserver" if forks else "spawn")
-        if forks:
-            self._context.set_forkserver_preload([preload])
+        self._workers = workers
+        self._idle: list[_Worker] = []
+        self._running: dict[Hashable, _Worker] = {}
+        self._handles = itertools.count()
         start_resource_tracker()
-        self._before = set(multiprocessing.active_children())
-        self._pools = [self._pool() for _ in range(workers)]
-        self._running: dict[Future[Any], int] = {}
 
     def free_slots(self) -> int:
         """See :class:`Engine`."""
-        return len(self._pools) - len(self._running)
+        return self._workers - len(self._running)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
         """See :class:`Engine`."""
-        slot = min(set(range(len(self._pools))) - set(self._running.values()))
+        handle = next(self._handles)
         with deaf_children():
-            try:
-                future = self._pools[slot].submit(function, *arguments)
-            except BrokenProcessPool:
-                # It was killed while it was idle.
-                self._renew(slot)
-                future = self._pools[slot].submit(function, *arguments)
-        self._running[future] = slot
-        return future
+            worker = self._running[handle] = self._idle.pop() if self._idle else _Worker()
+        # One that was killed while it was idle is found when the task is waited for.
+        with suppress(ConnectionError):
+            worker.pipe.send((function, arguments))
+        return handle
 
     def finished(self, seconds: float) -> dict[Hashable, Done]:
         """See :class:`Engine`."""
         found: dict[Hashable, Done] = {}
-        for future in wait(self._running, seconds, FIRST_COMPLETED).done:
-            slot = self._running.pop(future)
-            error = future.exception()
-            if isinstance(error, BrokenProcessPool):
-                self._renew(slot)
-                found[future] = Done(lost="its process ended without a word, perhaps for lack of memory")
-            else:
-                found[future] = Done(error=error) if error is not None else Done(future.result())
+        ready = wait([worker.pipe for worker in self._running.values()], seconds)
+        for handle in [handle for handle, worker in self._running.items() if worker.pipe in ready]:
+            worker = self._running.pop(handle)
+            try:
+                found[handle] = worker.pipe.recv()
+                self._idle.append(worker)
+            except (EOFError, OSError):
+                worker.end()
+                found[handle] = Done(lost="its process ended without a word, perhaps for lack of memory")
         return found
 
     def close(self) -> None:
         """See :class:`Engine`."""
-        for pool in self._pools:
-            pool.shutdown(wait=False, cancel_futures=True)
-        self._pools = []
-        children = set(multiprocessing.active_children()) - self._before
-        for child in children if self._running else ():
-            child.terminate()
-        for child in children if self._running else ():
-            child.join(_SECONDS_TO_END / len(children))
-            child.kill()
-        self._running = {}
+        running = list(self._running.values())
+        for worker in self._idle:
+            worker.pipe.close()
+        for worker in running:
+            worker.process.terminate()
+        for worker in running:
+            worker.process.join(_SECONDS_TO_END / len(running))
+            worker.end()
+        self._idle, self._running = [], {}
 
-    def _pool(self) -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(1, self._context, prepare_worker)
 
-    def _renew(self, slot: int) -> None:
-        self._pools[slot].shutdown(wait=False)
-        self._pools[slot] = self._pool()
+class _Worker:
+    """A process that runs the tasks which it gets through a pipe, until the pipe is closed."""
+
+    def __init__(self) -> None:
+        # A fork of a process with threads may hold their locks for ever.
+        context = multiprocessing.get_context("spawn")
+        self.pipe, other = context.Pipe()
+        self.process = context.Process(target=_work, args=(other,))
+        self.process.start()
+        # Only the worker has that end now, so that its death closes the pipe.
+        other.close()
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _work(pipe: Connection) -> None:
+    """In a worker: run tasks."""
+    prepare_worker()
+    while True:
+        try:
+            function, arguments = pipe.recv()
+        except EOFError:
+            return
+        try:
+            done = Done(function(*arguments))
+        except BaseException as error:  # a user's model may even exit
+            # Not every error can be sent, or be made again by the driver.
+            done = Done(error=InputError(describe_error(error)))
+        pipe.send(done)

@@ -25,3 +25,15 @@ def die_at_first(folder: Path, name: str, times: int = 1) -> str:
 def fail(message: str) -> None:
     """Raise an error that no input causes."""
     raise RuntimeError(message)
+
+
+class Strange(Exception):
+    """An error that cannot be made again from its text."""
+
+    def __init__(self, one: int, other: int) -> None:
+        super().__init__(f"{one} and {other}")
+
+
+def fail_strangely() -> None:
+    """Raise such an error."""
+    raise Strange(7, 8)

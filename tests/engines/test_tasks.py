@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from collections.abc import Hashable
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
-from calls import die_at_first, fail, mark
+from calls import die_at_first, fail, fail_strangely, mark
 
-from mcdenoise.engines import MOST_LOSSES, LocalEngine, Task, cluster, run_tasks
+from mcdenoise.engines import MOST_LOSSES, Done, LocalEngine, Task, cluster, run_tasks
 from mcdenoise.errors import InputError
 
 
@@ -49,3 +52,40 @@ def test_a_driver_of_another_version_is_refused() -> None:
     assert cluster._call(version("mcdenoise"), len, "four") == 4
     with pytest.raises(InputError, match=r"expected version 9\.9, as the driver has, found"):
         cluster._call("9.9", len, "four")
+
+
+def kill_children() -> int:
+    """Kill every process that this one has started, whatever it is for, and return how many there were."""
+    found = [int(each) for path in Path("/proc/self/task").glob("*/children") for each in path.read_text().split()]
+    for process in found:
+        os.kill(process, signal.SIGKILL)
+    return len(found)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
+@pytest.mark.filterwarnings("ignore:resource_tracker")
+def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
+    killed = []
+
+    class Attacked(LocalEngine):
+        """While workers start, after they have started, and while they wait for a task."""
+
+        def finished(self, seconds: float) -> dict[Hashable, Done]:
+            if len(killed) < 3:
+                found = super().finished(0.0 if not killed else 10.0)
+                killed.append(kill_children())
+                return found
+            return super().finished(seconds)
+
+    names = {f"{number}" for number in range(8)}
+    tasks = [Task(name, mark, (tmp_path, name)) for name in sorted(names)]
+    assert run_tasks(Attacked(2), tasks) == {}
+    assert min(killed) >= 1
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_errors_that_cannot_be_sent_are_told() -> None:
+    assert run_tasks(LocalEngine(1), [Task("own", fail_strangely), Task("exits", sys.exit, (0,))]) == {
+        "own": "Strange: 7 and 8",
+        "exits": "SystemExit: 0",
+    }

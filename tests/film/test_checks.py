@@ -90,7 +90,7 @@ def test_a_pattern_without_a_name_is_refused(
 def test_the_picked_model_is_told_everywhere(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers, preload: Inline())
+    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers: Inline())
     manifest = tmp_path / "film.toml"
     manifest.write_text(SHOT.format("any", ""))
     with pytest.raises(SystemExit):

@@ -70,7 +70,7 @@ def is_worker(process: int) -> bool:
         command = Path(f"/proc/{process}/cmdline").read_bytes()
     except OSError:
         return False
-    return (b"forkserver" in command or b"ray::" in command) and process != os.getpid()
+    return (b"multiprocessing.spawn" in command or b"ray::" in command) and process != os.getpid()
 
 
 def make_shots(folder: Path, count: int, frames: int) -> dict[str, Path]:

@@ -187,7 +187,7 @@ def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, dam
 def test_the_table_of_what_failed_and_status_1(
     shots: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers, preload: Inline())
+    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers: Inline())
     (shots["s1"] / "inputs/color2.exr").write_bytes(b"")
     manifest = write_manifest(tmp_path / "film.toml", {**shots, "gone": tmp_path / "nowhere"}, model=MODEL)
     with pytest.raises(SystemExit) as stop:
