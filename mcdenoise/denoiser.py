@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import reprlib
+import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -17,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.errors import InputError, did_you_mean, level_of_caller
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
+from mcdenoise.light import Repairs
 from mcdenoise.models import (
     DEFAULT,
     EXACT,
@@ -59,15 +61,20 @@ class FrameReport(Journal):
 
     Args:
         precision: the reason for the precision of the convolutions.
-        replaced_pixels: number of pixels of the noisy color that were NaN, infinite, negative or above 1e16.
+        repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
         missing: buffers that would improve the result and that the frame lacks.
         beside: milliseconds of work that overlaps with denoising another frame: read, write.
     """
 
     precision: str = ""
-    replaced_pixels: int = 0
+    repairs: Repairs = field(default_factory=Repairs)
     missing: list[str] = field(default_factory=list)
     beside: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def replaced_pixels(self) -> int:
+        """Number of pixels of the noisy color that were NaN, infinite, negative or above 1e16."""
+        return self.repairs.pixels
 
     def __str__(self) -> str:
         """A few lines: run times, the history, and what was skipped, missing or replaced."""
@@ -84,6 +91,7 @@ class FrameReport(Journal):
             "skipped": ", ".join(skipped),
             "missing": ", ".join(self.missing),
             "replaced pixels": str(self.replaced_pixels or ""),
+            "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
             "tiles": self.tiles,
             "precision": self.precision,
         }
@@ -180,6 +188,8 @@ class Denoiser:
         self._report = FrameReport()
         # Set by a caller that never writes into a frame again after passing it: then no buffer is copied.
         self.frames_stay = False
+        # Unset by a caller that shows what the reports doubt.
+        self.warns = True
         self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision != "float32")
         self.reset()
 
@@ -215,6 +225,7 @@ class Denoiser:
         _check_kind("frames", frames, (int, NoneType), "a whole number")
         _check_kind("layers", layers, (int,), "a whole number")
         self._state: State = None
+        self._doubted = False
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
@@ -254,8 +265,9 @@ class Denoiser:
         """Denoise the next frame of the shot.
 
         Args:
-            frame: a renderer's outputs, any float dtype. Pixels of ``color`` that are NaN, infinite, negative or above
-                1e16 are replaced and counted. Layers are used by :meth:`output` only. The denoiser keeps no reference
+            frame: a renderer's outputs, any float dtype. Values of ``color`` that are NaN, infinite, negative or above
+                1e16 are replaced and counted (:func:`mcdenoise.light.replace_invalid`), with a warning if the light
+                changes by more than 1 %. Layers are used by :meth:`output` only. The denoiser keeps no reference
                 to the buffers, so the next frame may be written into them.
 
         Returns:
@@ -331,15 +343,23 @@ class Denoiser:
     def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
         """The frame with valid values. An invalid one raises an error, on a GPU only when the numbers have arrived."""
         if at_hand(self.device):
-            frame, report.replaced_pixels, _ = frame.inspect()
+            frame, report.repairs, _ = frame.inspect()
+            self._doubt(report.repairs.doubt)
             return frame
         repaired = frame.repaired()
 
         def judge(numbers: Sequence[float]) -> None:
-            report.replaced_pixels = repaired.judge(numbers)
+            report.repairs = repaired.judge(numbers)
+            self._doubt(report.repairs.doubt)
 
         ask(repaired.numbers, judge)
         return repaired.frame
+
+    def _doubt(self, text: str) -> None:
+        """Warn of changed light, once a shot."""
+        if text and self.warns and not self._doubted:
+            self._doubted = True
+            warnings.warn(text, stacklevel=level_of_caller())
 
     def _settle(self) -> None:
         """Complete the report of the last frame; discard the history if that frame was invalid."""

@@ -105,6 +105,9 @@ class SequenceReport:
                 f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame "
                 "before, though the two look alike; check motion and cameras with `mcdenoise inspect`"
             )
+        if doubts := [(number, done.repairs.doubt) for number, done in self.frames.items() if done.repairs.doubt]:
+            number, doubt = doubts[0]
+            found.append(f"{doubt} (frame {number}, and {len(doubts) - 1} others of {len(self.frames)})")
         # These files may be other frames of the same shot and hours of work: only the user may remove them.
         if self.older:
             names = ", ".join(self.older if len(self.older) <= 4 else [self.older[0], "...", self.older[-1]])
@@ -326,7 +329,7 @@ def _read_frames(
     wanted = needs.buffers | needs.uses
     buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
     denoiser.reset(buffers, of or len(sequence), sequence.size, len(sequence.lights))
-    denoiser.frames_stay = True
+    denoiser.frames_stay, denoiser.warns = True, False
     streaming = denoiser.has_history(buffers)
 
     def read(number: int) -> tuple[Frame, float]:
@@ -502,6 +505,8 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
                 "reset": done.reset,
                 "history": done.history,
                 "replaced_pixels": done.replaced_pixels,
+                "negative_light": done.repairs.negative,
+                "light_gained": done.repairs.gained,
                 "missing": done.missing,
             }
             for number, done in report.frames.items()

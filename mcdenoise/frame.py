@@ -14,15 +14,10 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError, did_you_mean, level_of_caller
-from mcdenoise.ops._rows import by_rows
+from mcdenoise.light import LARGEST_RADIANCE, Repairs, is_valid, judged, repair
 
 # Half floats and a renderer's own arithmetic may exceed a range by this.
 _ROUNDING = 1e-2
-# Largest valid radiance, in any unit. Divided by the smallest albedo (0.04), squared, and summed over the 3 x 1024
-# values of the largest window, it stays below the largest float32: (25e16)^2 3072 = 2e38.
-LARGEST_RADIANCE = 1e16
-# A layer with a larger fraction of invalid pixels is not radiance; replacing them would damage the color.
-_MOST_BROKEN = 0.1
 
 
 @dataclass(frozen=True)
@@ -362,9 +357,9 @@ class Frame:
     def validate(self) -> tuple[Frame, int]:
         """Check every value: repair NaN, infinite and negative radiance; reject any other invalid buffer.
 
-        Pixels of ``color`` with NaN, infinity, a negative value or one above 1e16 are replaced by the mean of their
-        valid 3x3 neighbours (0 if there is none), so that these values do not spread. A pixel that has such a value in
-        a layer is treated in the same way. All layers are replaced where ``color`` is, so that they still add up.
+        Pixels of ``color`` and of layers with NaN, infinity, a negative value or one above 1e16 are replaced as
+        :func:`mcdenoise.light.replace_invalid` does it, so that these values do not spread. All layers are replaced
+        where ``color`` is, so that they still add up.
         Values of ``albedo`` and ``normal`` that exceed their range by rounding are clamped, and so are albedos up to 2
         (rough conductors evaluated at the normal). Albedos above 2 are clamped, with a warning, if they are less than
         half of the buffer.
@@ -373,24 +368,28 @@ class Frame:
             The valid frame, and the number of replaced pixels of ``color``.
 
         Raises:
-            InputError: another buffer holds NaN, an illegal infinity or a value far outside its range; or a layer has
-                invalid values in more than a tenth of the pixels in which ``color`` is valid.
+            InputError: another buffer holds NaN, an illegal infinity or a value far outside its range; ``color`` has no
+                value at all, or half as much negative light as positive; or a layer has that, or invalid values in
+                more than a tenth of the pixels in which ``color`` is valid.
         """
-        return self.inspect()[:2]
+        inspected = self.inspect()
+        return inspected.frame, inspected.repairs.pixels
 
     def inspect(self) -> Inspected:
         """Like :meth:`validate`, and also return the ranges of the other buffers."""
         changes: dict[str, Any] = {}
         ranges: dict[str, tuple[float, float]] = {}
-        (color, *layers), replaced = _replace_invalid(self.color, self.layers)
-        if replaced:
-            changes |= {"color": color, "layers": dict(zip(self.layers, layers, strict=True))}
+        repairs = Repairs()
+        if not all(map(is_valid, (self.color, *self.layers.values()))):
+            repaired = repair(self.color, self.layers, reads=True)
+            repairs = judged(repaired.numbers.tolist(), list(self.layers))
+            changes |= {"color": repaired.color, "layers": repaired.layers}
         for name, value in self.items():
             if name != "color":
                 clean, ranges[name] = _check_values(name, value)
                 if clean is not value:
                     changes[name] = clean
-        return Inspected(self.replace(**changes) if changes else self, replaced, ranges)
+        return Inspected(self.replace(**changes) if changes else self, repairs, ranges)
 
     def repaired(self) -> Unread:
         """Like :meth:`validate` without waiting for the device: repair everything, and read nothing.
@@ -446,87 +445,18 @@ class Inspected(NamedTuple):
 
     Args:
         frame: with valid values.
-        replaced: number of pixels of ``color`` that were replaced.
+        repairs: what was invalid in ``color`` and the layers.
         ranges: minimum and maximum of every buffer but ``color``, by name.
     """
 
     frame: Frame
-    replaced: int
+    repairs: Repairs
     ranges: dict[str, tuple[float, float]]
-
-
-def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
-    """Replace pixels with NaN, infinite, negative or too large radiance by the mean of their valid 3x3 neighbours.
-
-    Too large is radiance above :data:`LARGEST_RADIANCE` (1e16), for which float32 arithmetic may overflow: one such
-    value would make a network return an image of NaN.
-
-    Args:
-        color: ``(B, C, H, W)`` radiance.
-
-    Returns:
-        The valid radiance (``color`` itself if nothing was replaced), and the number of replaced pixels.
-
-    Example:
-        >>> color = torch.ones(1, 3, 3, 3)
-        >>> color[0, 1, 1, 1] = float("nan")
-        >>> clean, replaced = replace_invalid(color)
-        >>> replaced, clean[0, :, 1, 1].tolist()
-        (1, [1.0, 1.0, 1.0])
-    """
-    (clean,), replaced = _replace_invalid(color, {})
-    return clean, replaced
-
-
-def _replace_invalid(color: Tensor, layers: Mapping[str, Tensor]) -> tuple[list[Tensor], int]:
-    """Apply :func:`replace_invalid` to a color and its layers: the same pixels of each are replaced."""
-    images = [color, *layers.values()]
-    if all(map(_is_valid, images)):
-        return images, 0
-    usable = by_rows(_usable, color)
-    for name, layer in layers.items():
-        of_layer = by_rows(_usable, layer)
-        _refuse_broken(name, float(_broken(usable, of_layer)))
-        usable = usable & of_layer
-    return [by_rows(_filled, image, usable, reach=1) for image in images], int((~usable).sum())
-
-
-def _broken(usable: Tensor, of_layer: Tensor) -> Tensor:
-    """The fraction of the pixels that are invalid only because of a layer."""
-    return (usable & ~of_layer).float().mean()
-
-
-def _refuse_broken(name: str, broken: float) -> None:
-    if broken > _MOST_BROKEN:
-        raise InputError(
-            f"layer '{name}': expected radiance, not negative and finite, found something else in {broken:.0%} of "
-            "the pixels; leave it out"
-        )
 
 
 def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
     """Multiply the radiance of samples ``(B, S, C, H, W)`` by a ``(B, 3, H, W)`` factor; keep other channels."""
     return torch.cat([samples[:, :, :3] * factor[:, None], samples[:, :, 3:]], 2)
-
-
-def _is_valid(image: Tensor) -> bool:
-    # A single pass suffices to detect invalid values, because NaN propagates.
-    low, high = torch.aminmax(image)
-    return bool(low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf)
-
-
-def _usable(color: Tensor) -> Tensor:
-    valid = torch.isfinite(color) & (color >= 0) & (color <= LARGEST_RADIANCE)
-    return valid.all(dim=1, keepdim=True)
-
-
-def _filled(color: Tensor, usable: Tensor) -> Tensor:
-    zeroed = torch.where(usable, color, 0)
-    # Divide before summing, and not in half precision, so that bright neighbours do not overflow.
-    dtype = torch.promote_types(color.dtype, torch.float32)
-    total = torch.nn.functional.avg_pool2d(zeroed.to(dtype) / 9, 3, stride=1, padding=1, divisor_override=1)
-    count = torch.nn.functional.avg_pool2d(usable.to(dtype), 3, stride=1, padding=1, divisor_override=1)
-    return torch.where(usable, color, (total * (9 / count.clamp_min(1))).to(color.dtype))
 
 
 def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int] | None) -> Tensor:
@@ -676,7 +606,7 @@ class Unread(NamedTuple):
     Args:
         frame: with valid values, as far as they can be repaired.
         numbers: ``(N,)`` on the frame's device.
-        judge: takes the numbers after they have been read, and returns the number of replaced pixels of ``color``.
+        judge: takes the numbers after they have been read, and returns what was invalid in ``color``.
 
     Raises:
         InputError: raised by ``judge``, with the errors of :meth:`Frame.validate`.
@@ -684,21 +614,15 @@ class Unread(NamedTuple):
 
     frame: Frame
     numbers: Tensor
-    judge: Callable[[Sequence[float]], int]
+    judge: Callable[[Sequence[float]], Repairs]
 
 
 def _repaired(frame: Frame) -> Unread:
     """See :meth:`Frame.repaired`."""
-    images, layers = [frame.color, *frame.layers.values()], list(frame.layers)
-    usable = by_rows(_usable, frame.color)
+    repaired, layers = repair(frame.color, frame.layers, reads=False), list(frame.layers)
+    of_light = len(repaired.numbers)
     numbers: list[Tensor] = []
-    for layer in frame.layers.values():
-        of_layer = by_rows(_usable, layer)
-        numbers.append(_broken(usable, of_layer))
-        usable = usable & of_layer
-    color, *mended = (by_rows(_filled, image, usable, reach=1) for image in images)
-    numbers.append((~usable).sum())
-    changes: dict[str, Any] = {"color": color, "layers": dict(zip(layers, mended, strict=True))}
+    changes: dict[str, Any] = {"color": repaired.color, "layers": repaired.layers}
     names = [name for name, _ in frame.items() if name != "color"]
     for name in names:
         value = frame.buffer(name)
@@ -709,19 +633,16 @@ def _repaired(frame: Frame) -> Unread:
         if spec.high != _UNBOUNDED or spec.low != -_UNBOUNDED:
             changes[name] = value.clamp(spec.low, spec.high)
 
-    def judge(read: Sequence[float]) -> int:
-        found = iter(read)
-        for layer in layers:
-            _refuse_broken(layer, next(found))
-        replaced = int(next(found))
+    def judge(read: Sequence[float]) -> Repairs:
+        repairs, found = judged(read[:of_light], layers), iter(read[of_light:])
         for name in names:
             low, high, illegal, above = (next(found) for _ in range(4))
             if illegal:
                 _refuse_illegal(name, int(illegal))
             if low < _spec_of(name).low or high > _spec_of(name).high:
                 _refuse_range(name, low, high, above)
-        return replaced
+        return repairs
 
     # Created on the device, because copying a number from the host would wait.
-    dtype = torch.promote_types(frame.color.dtype, torch.float32)
-    return Unread(frame.replace(**changes), torch.stack([number.to(dtype) for number in numbers]), judge)
+    others = [number.to(repaired.numbers.dtype)[None] for number in numbers]
+    return Unread(frame.replace(**changes), torch.cat([repaired.numbers, *others]), judge)

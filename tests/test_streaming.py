@@ -201,11 +201,9 @@ def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], pr
         color[0, :, 10, 20] = value
         return [shot[0], shot[1].replace(color=color), *shot[2:]]
 
-    expected = denoised(with_pixel(window[:, [0, 1, 2, 3, 5, 6, 7, 8]].mean(1)), Denoiser(MODEL, precision=precision))
+    expected = denoised(with_pixel(window[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(1)), Denoiser(MODEL, precision=precision))
     for value in (3.4e38, 1e37, 1.1e16):
         broken = with_pixel(value)
-        # One channel is enough.
-        broken[1].color[0, 1:, 10, 20] = 1.0
         denoiser = Denoiser(MODEL, precision=precision)
         for number, (frame, image) in enumerate(zip(broken, expected, strict=True)):
             torch.testing.assert_close(denoiser(frame), image)

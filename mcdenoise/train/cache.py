@@ -28,7 +28,8 @@ from torch import Tensor
 
 from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame, replace_invalid
+from mcdenoise.frame import Frame
+from mcdenoise.light import replace_invalid
 from mcdenoise.models.accumulated import motion_to_previous
 from mcdenoise.train.front import ACCUMULATED, Front
 
@@ -188,7 +189,7 @@ def open_cached(
     Features are stored once (those with noise once for each noise seed). Radiance is stored once for each first frame
     and noise seed: a shot that begins later has shorter histories, so that a network also learns the beginning of a
     shot. Features are stored in half precision if that is exact, radiance in single precision. Invalid pixels of
-    radiance and reference (NaN, infinite, negative, or too large) are replaced by the mean of their neighbours. Motion
+    radiance and reference (NaN, infinite, negative, or too large) are replaced, as ``Frame.validate`` does it. Motion
     is the sequence's own, or computed from positions and cameras; then it is infinite (unknown) in the first frame.
 
     Arrays that were computed from other files (by name, size or modification time), with other settings or by another
@@ -330,8 +331,8 @@ def _read(sequence: Sequence, number: int, noise_seed: int, buffers: Collection[
     for image in radiance.values():
         digest.update(image.numpy().tobytes())
     # ``validate`` replaces invalid pixels only in the color; a reference comes from the same renderer.
-    mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
     try:
+        mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
         return frame.replace(**mended).validate()[0].with_depth()
     except InputError as error:
         raise InputError(f"{sequence.root}, frame {number}: {error}") from error

@@ -227,7 +227,7 @@ def test_repairs_are_those_of_validation() -> None:
     frame = frame.replace(albedo=frame.albedo * 1.9, normal=frame.normal * 1.001, layers={"half": frame.color / 2})
     expected, count = frame.validate()
     repaired = frame.repaired()
-    assert repaired.judge(repaired.numbers.tolist()) == count == 4
+    assert repaired.judge(repaired.numbers.tolist()).pixels == count == 4
     for name, value in expected.items():
         assert torch.equal(value, repaired.frame.buffer(name)), name
     assert torch.equal(repaired.frame.layers["half"], expected.layers["half"])

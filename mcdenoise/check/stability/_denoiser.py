@@ -13,7 +13,8 @@ from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, ROUNDED, relative_change
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame, replace_invalid
+from mcdenoise.frame import Frame
+from mcdenoise.light import replace_invalid
 from mcdenoise.methods import parse_method
 from mcdenoise.models import DEFAULT, Output, Precision
 from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN
@@ -141,7 +142,7 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
 
 
 def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:
-    """An invalid pixel is repaired: the images are exactly those of frames with the mean of its neighbours instead."""
+    """An invalid pixel is repaired: the images are exactly those of frames with the repaired one instead."""
     message, images = "", list[list[Tensor]]()
     for repaired in (False, True):
         denoiser.reset()
