@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import time
@@ -21,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.files import check_writable, remove, write_text
+from mcdenoise.data.files import check_writable, remove, write_json
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
@@ -286,7 +285,7 @@ def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: Sequ
         InputError: the file cannot be written.
     """
     report.older = _of_earlier_runs(out, report.files.values())
-    write_text(out / "denoise.json", json.dumps(_as_json(sequence, denoiser, report), indent=2) + "\n")
+    write_json(out / "denoise.json", _as_json(sequence, denoiser, report))
 
 
 def denoised_frames(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterable
@@ -102,6 +101,6 @@ def write_json(path: Path | None, content: Any) -> None:
     """Write the content of a printed table to the file of ``--json``, if it is given."""
     if path is not None:
         # Imported here because it loads the reader of images, which not every command needs.
-        from mcdenoise.data.files import write_text
+        from mcdenoise.data import files
 
-        write_text(path, json.dumps(content, indent=2) + "\n")
+        files.write_json(path, content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import time
@@ -14,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.data.files import held, sweep, write_text
+from mcdenoise.data.files import held, sweep, write_json
 from mcdenoise.engines import MOST_LOSSES, Done, Engine, RayEngine, describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
@@ -234,9 +233,8 @@ class _Run:
                 self._count()
         finally:
             self.result.seconds = time.monotonic() - self.began
-            content = json.dumps(_as_json(self.film, self.result, created), indent=1, allow_nan=False)
             try:
-                write_text(self.film.out / FILE, content + "\n")
+                write_json(self.film.out / FILE, _as_json(self.film, self.result, created))
             except InputError as error:
                 self.result.trouble = str(error)
         return self.result

@@ -15,7 +15,7 @@ import numpy as np
 
 from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.files import atomic_path, write_json
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles import Blender
 from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
@@ -180,7 +180,7 @@ def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path | None,
     for n in shot.references:
         found = [path for k in range(_PARTS) if (path := _part(parts, k, n)).is_file()]
         noise[str(n)] = _write_reference(folder / _reference_file(n), found, samples)
-    write_text(folder / "camera.json", json.dumps({"reference_noise": noise}) + "\n")
+    write_json(folder / "camera.json", {"reference_noise": noise})
 
 
 def _image(frame: int, samples: int, seed: int, out: Path, *, passes: bool) -> dict[str, Any]:

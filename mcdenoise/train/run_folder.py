@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from mcdenoise.data.files import atomic_path, held, write_text
+from mcdenoise.data.files import atomic_path, held, json_text, write_text
 from mcdenoise.errors import InputError, is_unicode
 from mcdenoise.reading import read_bytes, read_text
 
@@ -134,7 +134,7 @@ class RunFolder:
             OSError: the file cannot be written.
         """
         with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+            file.write(json_text(entry) + "\n")
 
     def errors(self) -> dict[str, float]:
         """The errors of the last validation; empty if there was none.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mcdenoise.data import files
-from mcdenoise.data.files import atomic_path, new_folder, write_text
+from mcdenoise.data.files import atomic_path, new_folder, write_json, write_text
 from mcdenoise.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and locks")
@@ -170,3 +171,14 @@ def test_a_file_that_cannot_be_removed_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="folder: expected to replace it, found what cannot be removed"):
         files.remove(tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_json_has_no_nan(tmp_path: Path) -> None:
+    content = {"a": [float("nan"), (float("inf"), 1.5)], "b": {"c": -float("inf")}, "d": "NaN"}
+    write_json(tmp_path / "x.json", content)
+
+    def refuse(token: str) -> None:
+        raise AssertionError(token)
+
+    read = json.loads((tmp_path / "x.json").read_text(), parse_constant=refuse)
+    assert read == {"a": [None, [None, 1.5]], "b": {"c": None}, "d": "NaN"}

@@ -23,7 +23,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
 from mcdenoise.data.exr import Image
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import write_json
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
@@ -232,7 +232,7 @@ class _Folder:
             content["normal_limit_squared"],
         )
         write_camera_matrices(path / "camera_matrices.h", cameras, _CONVENTIONS["conventions"]["camera_matrices"])
-        write_text(described, json.dumps(content, indent=1) + "\n")
+        write_json(described, content)
 
     def _check(self, described: Path, content: Mapping[str, Any]) -> None:
         try:

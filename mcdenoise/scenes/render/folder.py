@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, read_exr_header
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import write_json
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
@@ -185,7 +185,7 @@ class SequenceFolder:
         spp = {str(number): state.spp for number, state in states}
         noise = {str(number): state.noise for number, state in states}
         content = {**self._settings, "reference_spp": spp, "reference_noise": noise}
-        write_text(self._description, json.dumps(content, indent=1) + "\n")
+        write_json(self._description, content)
 
 
 def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceState) -> None:
