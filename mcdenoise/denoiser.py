@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
+import os
 import reprlib
+import threading
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Concatenate, Literal, ParamSpec, TypeVar, get_args
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -53,6 +57,39 @@ AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
 # Level of noise of frames with some eight samples a pixel; training/README.md has the errors of both models.
 _MANY_SAMPLES = 0.1
+
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+# The locks are not in the denoisers, which can be copied to another process.
+_locks: WeakKeyDictionary[Denoiser, threading.RLock] = WeakKeyDictionary()
+# The process, if it has denoised frames, and so may have started threads of torch.
+_started: set[int] = set()
+
+
+def _in_turn(
+    method: Callable[Concatenate[Denoiser, _Arguments], _Result],
+) -> Callable[Concatenate[Denoiser, _Arguments], _Result]:
+    """Run a denoiser's methods in one thread at a time."""
+
+    @functools.wraps(method)
+    def alone(denoiser: Denoiser, /, *arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
+        with _locks.setdefault(denoiser, threading.RLock()):
+            return method(denoiser, *arguments, **settings)
+
+    return alone
+
+
+def _after_fork() -> None:
+    """Make a forked process independent of its parent's threads: it has none of them, and would wait for them."""
+    _locks.clear()
+    if _started:
+        torch.set_num_threads(1)
+    _started.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 @dataclass
@@ -100,6 +137,9 @@ class FrameReport(Journal):
 
 class Denoiser:
     """Denoises the frames of a shot one after the other, and keeps the method's state.
+
+    Denoisers in several threads do not affect one another. Frames that several threads give to one denoiser are
+    denoised one after the other, as one shot in the order of their arrival; ``report`` is that of the last of them.
 
     Args:
         model: the name of a model in the zoo (its shipped weights are loaded), your own ``path/to/file.py:factory`` or
@@ -202,6 +242,7 @@ class Denoiser:
             return Chosen("float32", "what bfloat16 rounds in a model of your own is for you to judge")
         return fastest_precision(self.device) if has_network(self.model) else Chosen("float32", "nothing is learnt")
 
+    @_in_turn
     def reset(
         self,
         buffers: Collection[str] | None = None,
@@ -243,6 +284,7 @@ class Denoiser:
                 self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     @property
+    @_in_turn
     def report(self) -> FrameReport:
         """The report of the last frame. On a GPU, this waits until the frame is done.
 
@@ -253,6 +295,7 @@ class Denoiser:
         self._settle()
         return self._report
 
+    @_in_turn
     def detach(self) -> None:
         """Detach the history from the graph, for truncated backpropagation: later ``backward`` ends here."""
         self._state = pytree.tree_map_only(Tensor, Tensor.detach, self._state)
@@ -302,8 +345,10 @@ class Denoiser:
         """
         return self._step(frame, stages=stages)
 
+    @_in_turn
     def _step(self, frame: Frame, *, stages: bool) -> Output:
         _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
+        _started.add(os.getpid())
         self._settle()
         self._report = report = FrameReport(precision=self._why_precision)
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():

@@ -12,6 +12,7 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
+from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import ask
 from mcdenoise.models._reads import at_hand
@@ -93,7 +94,7 @@ def _ready() -> dict[str, frozenset[str]]:
     found = {}
     shipped = pretrained_models()
     # Constructing a network draws random numbers: keep the caller's generator unchanged.
-    with torch.random.fork_rng(devices=[]):
+    with without_draws():
         for name in list_models():
             try:
                 needs = build_model(name).needs if find_model(name).installed else None

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -148,23 +149,23 @@ class Journal:
             self.milliseconds[span.stage] = self.milliseconds.get(span.stage, 0.0) + span.own
 
 
-_listening: list[Journal] = []
+_listening: ContextVar[Journal | None] = ContextVar("listening", default=None)
 
 
 @contextmanager
 def listening(journal: Journal) -> Iterator[None]:
-    """Collect the reports of methods in a journal inside this block."""
-    _listening.append(journal)
+    """Collect the reports of this thread's methods in a journal inside this block."""
+    token = _listening.set(journal)
     try:
         yield
     finally:
-        _listening.pop()
+        _listening.reset(token)
     journal.send()
 
 
 def journal() -> Journal | None:
     """The active journal, or ``None``."""
-    return _listening[-1] if _listening and not torch.compiler.is_compiling() else None
+    return None if torch.compiler.is_compiling() else _listening.get()
 
 
 def note(name: str, reason: str, skipped: float = 0.0, *, exact: bool = True) -> None:

@@ -13,6 +13,7 @@ from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
+from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._registry import Kind, build_model, find_model, list_models
 from mcdenoise.models._weights import compared_models, pretrained_models
 
@@ -67,7 +68,7 @@ def users_of(buffers: Iterable[str]) -> dict[str, list[str]]:
     """For each given buffer, the sorted names of the models that need or use it."""
     needs: dict[str, frozenset[str]] = {}
     # Constructing a network draws random numbers: keep the caller's generator unchanged.
-    with torch.random.fork_rng(devices=[]):
+    with without_draws():
         for name in list_models():
             # A model that cannot be made uses nothing.
             with suppress(InputError):

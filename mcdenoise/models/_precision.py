@@ -7,6 +7,7 @@ import math
 import os
 import platform
 import statistics
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -35,6 +36,8 @@ ENVIRONMENT = "MCDENOISE_PRECISION"
 # Minimum speed-up of bfloat16; a smaller one is not worth the rounding.
 _WORTH = 1.2
 _CHANNELS, _SIDE, _ROUNDS = 32, 160, 7
+# The number of threads belongs to the process.
+_measuring = threading.Lock()
 
 
 class Chosen(NamedTuple):
@@ -157,18 +160,19 @@ def _measured(device: torch.device) -> float:
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
     times: dict[FloatPrecision, list[float]] = {precision: [] for precision in FLOATS}
-    watch, threads = Stopwatch(device), torch.get_num_threads()
-    # On a busy machine, several threads would mostly wait for one another.
-    torch.set_num_threads(1)
-    try:
-        with torch.inference_mode():
+    watch = Stopwatch(device)
+    with _measuring, torch.inference_mode():
+        # On a busy machine, several threads would mostly wait for one another.
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
             for precision in FLOATS * _ROUNDS:
                 with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
                     start = watch.mark()
                     F.conv2d(image, weight, padding=1)
                     times[precision].append(watch.between(start, watch.mark()))
-    finally:
-        torch.set_num_threads(threads)
+        finally:
+            torch.set_num_threads(threads)
     # The first rounds compile kernels.
     exact, rounded = (statistics.median(own[2:]) for own in times.values())
     return exact / rounded

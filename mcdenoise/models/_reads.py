@@ -8,23 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 
-_reads_disabled = False
+_reads_disabled: ContextVar[bool] = ContextVar("reads_disabled", default=False)
 
 
 def at_hand(device: torch.device) -> bool:
     """Whether the host may read values on a device while a step runs; a graph being recorded has none."""
-    return device.type == "cpu" and not _reads_disabled and not torch.compiler.is_compiling()
+    return device.type == "cpu" and not torch.compiler.is_compiling() and not _reads_disabled.get()
 
 
 @contextmanager
 def without_reads() -> Iterator[None]:
-    """Make steps on a CPU read no values inside this block, as on a GPU, in all threads."""
-    global _reads_disabled
-    before, _reads_disabled = _reads_disabled, True
+    """Make steps of this thread on a CPU read no values inside this block, as on a GPU."""
+    token = _reads_disabled.set(True)
     try:
         yield
     finally:
-        _reads_disabled = before
+        _reads_disabled.reset(token)

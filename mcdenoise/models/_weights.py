@@ -17,6 +17,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
+from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import Entry, build_model, find_model, is_registered, outline_model
 from mcdenoise.nn import UNet
@@ -111,7 +112,8 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
             if entry.of_zoo and description["settings"] != entry.architecture:
                 # Shapes are compared before memory is taken, of which a header can ask for any amount.
                 _check_shapes(path, found, _shapes(outline_model(name, every), shapes), shapes)
-            model = build_model(name, **every)
+            with without_draws():
+                model = build_model(name, **every)
         except (TypeError, ValueError, RuntimeError, ArithmeticError, LookupError, MemoryError) as error:
             if isinstance(error, InputError) and str(error).startswith(f"{path}: "):
                 raise

@@ -6,6 +6,7 @@ import functools
 import importlib
 import importlib.util
 import os
+import threading
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Literal, get_args
@@ -21,8 +22,16 @@ _FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba",
 _EXTRAS = {"numba": "fast", "triton": "gpu"}
 # Pixels of a batch below which importing numba and calling it takes longer than the reference implementation does.
 _FEW_PIXELS = 8192
-# The backend of `use`, and whether an op that cannot run in it raises.
-_used: tuple[Backend, bool] | None = None
+
+
+class _Used(threading.local):
+    """The backend of :func:`use` in this thread, and whether an op that cannot run in it raises."""
+
+    choice: tuple[Backend, bool] | None = None
+
+
+# Torch's compiler traces it, which it cannot do with a ContextVar.
+_used = _Used()
 # Triton's interpreter computes with the memory of any device, slowly: for tests.
 _INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
@@ -46,7 +55,7 @@ def choose_backend(
     Raises:
         ValueError: the backend of :func:`use` cannot run; the message says why.
     """
-    wanted, strict = _used or (_fastest(tensors), False)
+    wanted, strict = _used.choice or (_fastest(tensors), False)
     obstacle = _obstacle(wanted, tensors, wanted in differentiable, backends)
     if obstacle and strict:
         raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
@@ -55,7 +64,7 @@ def choose_backend(
 
 @contextmanager
 def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
-    """Run all ops that have this backend in it, in all threads, within the context.
+    """Run all ops of this thread that have this backend in it, within the context.
 
     Args:
         backend: ``"torch"`` is plain torch, which runs everywhere and has derivatives of any order. ``"numba"`` is
@@ -71,13 +80,12 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
         >>> with ops.use("torch"):
         ...     half = ops.downsample(torch.ones(1, 3, 4, 4))
     """
-    global _used
     check_backend(backend)
-    before, _used = _used, (backend, strict)
+    before, _used.choice = _used.choice, (backend, strict)
     try:
         yield
     finally:
-        _used = before
+        _used.choice = before
 
 
 @contextmanager
@@ -89,7 +97,7 @@ def one_backend(image: Tensor) -> Iterator[None]:
     Args:
         image: ``(B, C, H, W)``.
     """
-    with nullcontext() if _used is not None else use(_fastest([image]), strict=False):
+    with nullcontext() if _used.choice is not None else use(_fastest([image]), strict=False):
         yield
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -34,6 +35,8 @@ _Result = TypeVar("_Result")
 
 # The fast backends that have been loaded, by backend and op.
 _loaded: dict[tuple[str, str], Callable[..., Any]] = {}
+# Torch takes the derivatives of an operator once. Loading one may load another.
+_loading = threading.RLock()
 
 
 def op(
@@ -112,14 +115,17 @@ def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
     name = plain.__name__
     if (backend, name) in _loaded:
         return
-    module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
-    function: Callable[..., Any] = getattr(module, name)
-    gradients = getattr(module, f"{name}_gradients", None)
-    operator = getattr(gradients, "operator", function)
-    if gradients is not None and isinstance(operator, Operator):
-        adapted = getattr(gradients, "adapted", _by_position)
-        _differentiate(operator, gradients, adapted(plain))
-    _loaded[backend, name] = function
+    with _loading:
+        if (backend, name) in _loaded:
+            return
+        module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
+        function: Callable[..., Any] = getattr(module, name)
+        gradients = getattr(module, f"{name}_gradients", None)
+        operator = getattr(gradients, "operator", function)
+        if gradients is not None and isinstance(operator, Operator):
+            adapted = getattr(gradients, "adapted", _by_position)
+            _differentiate(operator, gradients, adapted(plain))
+        _loaded[backend, name] = function
 
 
 # The compiler calls this while it traces, and does not trace into it.
