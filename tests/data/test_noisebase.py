@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import warnings
 import zipfile
+import zlib
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -311,6 +313,30 @@ def test_compressed_bombs_and_false_sizes_are_refused_before_memory_is_allocated
         assert most < 2**22, f"{name}: {most}"
         assert str(told.value).isprintable(), name
         assert len(str(told.value)) < 700 + len(str(copy)), name
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize("name", ["color/.zarray", "color/0.0.0.0"])
+def test_a_member_that_is_larger_than_it_says(tmp_path: Path, name: str, method: int) -> None:
+    """Sizes and checksum are those of its first bytes; what follows are zeros."""
+    path = write(tmp_path / "frame0.zip", arrays(0))
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(tmp_path / "bomb.zip", "w") as bomb:
+        for each in source.namelist():
+            content = source.read(each)
+            if each != name:
+                bomb.writestr(each, content)
+                continue
+            bomb.writestr(each, content + bytes(2**26), method)
+            # The directory at the end of the zip is written when it is closed.
+            bomb.infolist()[-1].CRC, bomb.infolist()[-1].file_size = zlib.crc32(content), len(content)
+    tracemalloc = pytest.importorskip("tracemalloc")
+    tracemalloc.start()
+    # Of deflate, the first bytes are whole and all that is read.
+    with pytest.raises(InputError, match=r"bomb\.zip") if method != zipfile.ZIP_DEFLATED else nullcontext():
+        open_sequence(tmp_path / "bomb.zip").frame(0)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 2**24
 
 
 def test_damaged_zips(tmp_path: Path) -> None:

@@ -374,7 +374,15 @@ def _read(file: zipfile.ZipFile, name: str, limit: int) -> bytes:
     info = file.getinfo(name)
     if info.file_size > min(limit, _LARGEST_RATIO * info.compress_size + _SMALL):
         raise _damaged(file, f"'{name}' of {info.file_size} bytes")
-    return file.read(info)
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        # These are decompressed whole, whatever size is stated.
+        raise _damaged(file, f"'{name}' compressed by another method than deflate")
+    with file.open(info) as stream:
+        # With a size, no more than that is decompressed.
+        content = stream.read(info.file_size)
+    if len(content) != info.file_size:
+        raise _damaged(file, f"'{name}' of {len(content)} bytes instead of {info.file_size}")
+    return content
 
 
 def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
