@@ -6,7 +6,8 @@ import ast
 import importlib
 import importlib.util
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.abc import Loader
 from pathlib import Path
 from types import ModuleType
@@ -34,28 +35,47 @@ def load_own(name: str, kind: str, thing: str, *, other: str = "") -> tuple[Any,
         The attribute, and the module that defines it.
 
     Raises:
-        InputError: the file or module does not exist, cannot be imported, or has no such attribute.
+        InputError: the file or module does not exist, is of the standard library, cannot be imported, or has no such
+            attribute.
     """
     if name.endswith(".py"):
         functions = [each for each in _functions_in(Path(name), kind, thing) if each != other]
         choice = " or ".join(f":{each}" for each in functions or [thing])
         raise InputError(f"{kind} '{name}': expected {name}:{thing}, found only the file; add {choice}")
     place, _, attribute = name.rpartition(":")
-    try:
+    if place.partition(".")[0] in sys.stdlib_module_names:
+        raise InputError(
+            f"{kind} '{name}': expected a {thing} of a file or a package, found the standard library's {place}, which "
+            f"has none; write ./{place}.py:{attribute} if it is a file"
+        )
+    with refused(f"{kind} '{name}': {place} cannot be imported"):
         module = _module_of_file(Path(place), kind, thing) if place.endswith(".py") else importlib.import_module(place)
-    except InputError:
+        if hasattr(module, attribute):
+            return getattr(module, attribute), module
+    offered = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
+    raise InputError(f"{kind} '{name}': expected a {thing} '{attribute}' in {place}, found {offered or 'none'}")
+
+
+@contextmanager
+def refused(what: str) -> Iterator[None]:
+    """Turn whatever a user's code raises inside this block, its wish to exit included, into an ``InputError``."""
+    try:
+        yield
+    except (InputError, KeyboardInterrupt):
         raise
-    except Exception as error:
-        raise InputError(f"{kind} '{name}': {place} cannot be imported: {in_one_line(error)}") from error
-    if not hasattr(module, attribute):
-        offered = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
-        raise InputError(f"{kind} '{name}': expected a {thing} '{attribute}' in {place}, found {offered or 'none'}")
-    return getattr(module, attribute), module
+    except BaseException as error:
+        raise InputError(f"{what}: {in_one_line(error)}") from error
 
 
-def in_one_line(error: Exception) -> str:
+def in_one_line(error: BaseException) -> str:
     """Type and message of an error raised by a user's code, in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+    name = type(error).__name__
+    if isinstance(error, SystemExit):
+        return f"it ends the program ({name}: {error})"
+    # The text of an exception is a user's code, too.
+    with suppress(Exception):
+        return f"{name}: {' '.join(str(error).split())}"
+    return name
 
 
 def _check_file(path: Path, kind: str, thing: str) -> None:

@@ -134,11 +134,17 @@ def _run(name: str, arguments: list[str]) -> int:
     try:
         with _no_collection():
             command = parse(name, arguments[1:])
-        _check_json(command)
-        return command() or 0
     except SystemExit as stop:
         # The help of the command was printed.
         return int(stop.code or 0)
+    _check_json(command)
+    try:
+        return command() or 0
+    except SystemExit as stop:
+        # No command ends in this way, so a model or a function of the user has asked for it.
+        raise InputError(
+            f"expected code of yours that goes on, found that it ends the program (SystemExit: {stop})"
+        ) from stop
 
 
 @contextlib.contextmanager

@@ -10,8 +10,8 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import console_of_tables, show, write_json
-from mcdenoise.models import ModelOverview, overview
+from mcdenoise.cli._output import console_of_tables, show, warn, write_json
+from mcdenoise.models import ModelOverview, overview, troubles
 
 _MEASURED = ("SMAPE", "ms a frame")
 # In a narrower terminal the descriptions take the place of these columns.
@@ -51,6 +51,7 @@ def models(results: Path | None = None, json: Json = None) -> None:
     print(_WEIGHTS)
     if hidden:
         print(f"not shown, for lack of width (see --json): {', '.join(sorted(hidden))}")
+    warn(troubles())
     write_json(json, [asdict(entry) for entry in entries])
 
 

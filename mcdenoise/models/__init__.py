@@ -17,7 +17,7 @@ from mcdenoise.models._precision import (
     precisions_of,
     quantize,
 )
-from mcdenoise.models._registry import build_model, find_model, list_models, register_model
+from mcdenoise.models._registry import build_model, find_model, list_models, register_model, troubles
 from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._weights import (
     compared_models,
@@ -107,6 +107,7 @@ __all__ = [
     "start_with",
     "summarize",
     "timed",
+    "troubles",
     "users_of",
     "with_carried",
 ]

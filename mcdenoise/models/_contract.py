@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from mcdenoise.models._journal import ask
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._registry import build_model, find_model, list_models
 from mcdenoise.models._weights import pretrained_models
+from mcdenoise.own import in_one_line, refused
 
 
 def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...]) -> tuple[Output, State]:
@@ -37,6 +39,8 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
         found: Any = model(frame, state)
     except InputError:
         raise
+    except SystemExit as error:
+        raise InputError(f"model: expected an image, found that {in_one_line(error)}") from error
     except Exception as error:
         if state is None or shape == tuple(frame.color.shape):
             raise
@@ -96,10 +100,10 @@ def _ready() -> dict[str, frozenset[str]]:
     # Constructing a network draws random numbers: keep the caller's generator unchanged.
     with without_draws():
         for name in list_models():
-            try:
+            needs = None
+            # A model of an installed package may raise anything; such a model is not offered.
+            with suppress(InputError), refused(name):
                 needs = build_model(name).needs if find_model(name).installed else None
-            except Exception:  # a third-party model may raise anything; such a model is not offered
-                continue
             # A method that reads only the pixel itself does not denoise.
             if needs is not None and needs.reach != 0 and (name in shipped or not needs.trainable):
                 found[name] = needs.buffers

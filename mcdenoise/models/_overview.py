@@ -16,6 +16,7 @@ from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._registry import Kind, build_model, find_model, list_models
 from mcdenoise.models._weights import compared_models, pretrained_models
+from mcdenoise.own import refused
 
 _SIDE = 64  # a multiple of every model's padding, so that no padded pixel is counted
 
@@ -71,7 +72,7 @@ def users_of(buffers: Iterable[str]) -> dict[str, list[str]]:
     with without_draws():
         for name in list_models():
             # A model that cannot be made uses nothing.
-            with suppress(InputError):
+            with suppress(InputError), refused(name):
                 found = build_model(name).needs
                 needs[name] = found.buffers | found.uses
     return {buffer: [name for name, own in needs.items() if buffer in own] for buffer in buffers}
@@ -82,20 +83,21 @@ def _overview(name: str, weights: str) -> ModelOverview:
     try:
         entry = find_model(name)
         listed = partial(ModelOverview, name, entry.description, entry.kind, entry.paper)
-        model = build_model(name)
+        with refused(f"model '{name}': it fails"):
+            model = build_model(name)
+            needs = model.needs
+            parameters = sum(each.numel() for each in model.parameters()) if isinstance(model, nn.Module) else 0
+            weights = weights or ("to train" if needs.trainable else "its own")
+            return listed(
+                parameters=parameters,
+                kmacs_per_pixel=_kmacs_per_pixel(name, entry.construct) if parameters else None,
+                weights=weights if parameters else "none",
+                needs=sorted(needs.buffers),
+                uses=sorted(needs.uses),
+                trainable=needs.trainable,
+            )
     except InputError as error:
         return listed(reason=str(error))
-    needs = model.needs
-    parameters = sum(each.numel() for each in model.parameters()) if isinstance(model, nn.Module) else 0
-    weights = weights or ("to train" if needs.trainable else "its own")
-    return listed(
-        parameters=parameters,
-        kmacs_per_pixel=_kmacs_per_pixel(name, entry.construct) if parameters else None,
-        weights=weights if parameters else "none",
-        needs=sorted(needs.buffers),
-        uses=sorted(needs.uses),
-        trainable=needs.trainable,
-    )
 
 
 # The constructor is part of the cache key, because another model may be registered under the same name.

@@ -9,9 +9,10 @@ import inspect
 import pkgutil
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatch
-from importlib.metadata import entry_points
+from importlib.metadata import Distribution, EntryPoint, distributions
+from types import BuiltinFunctionType
 from typing import Any, Literal, get_args
 
 from torch import nn
@@ -20,7 +21,7 @@ from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import outlined, plain_defaults
 from mcdenoise.models._interface import Model
-from mcdenoise.own import in_one_line, load_own
+from mcdenoise.own import in_one_line, load_own, refused
 
 GROUP = "mcdenoise.models"
 _FACTORY = "expected a factory, a function without required arguments that returns a model"
@@ -106,13 +107,24 @@ def register_model(
 def list_models(pattern: str = "*") -> list[str]:
     """Sorted names of all registered models that match a shell-style pattern, including those of installed packages."""
     _import_pages()
-    return sorted(name for name in {*_MODELS, *_installed()} if fnmatch(name, pattern))
+    return sorted(name for name in {*_MODELS, *_offered().points} if fnmatch(name, pattern))
+
+
+def troubles() -> list[str]:
+    """One line for each installed package whose offer of models cannot be read, or is of a name that is taken."""
+    _import_pages()
+    taken = [
+        f"{_named(point.dist)}: expected a name for its model that is not taken, found '{name}', which is not used"
+        for name, point in _offered().points.items()
+        if name in _MODELS and _MODELS[name].of_zoo
+    ]
+    return taken + _offered().troubles
 
 
 def is_registered(name: str) -> bool:
     """Whether a name is that of a registered model, without importing code that a name could point to."""
     _import_pages()
-    return name in _MODELS or name in _installed()
+    return name in _MODELS or name in _offered().points
 
 
 def find_model(name: str) -> Entry:
@@ -128,8 +140,9 @@ def find_model(name: str) -> Entry:
     _import_pages()
     if name in _MODELS:
         return _MODELS[name]
-    if name in _installed():
-        return _of_factory(name, _loaded_entry_point(name))
+    if name in (points := _offered().points):
+        with refused(f"model '{name}': the package {_named(points[name].dist)} offers it and cannot load it"):
+            return _of_factory(name, points[name].load())
     known = list_models()
     if (match := re.fullmatch(r"([^()]+)\((.*)\)", name)) and (match[1] in known or ":" in match[1]):
         # On the command line, texts have no quotes.
@@ -166,10 +179,14 @@ def outline_model(name: str, settings: dict[str, Any]) -> Model:
 
 def _build_model(name: str, settings: dict[str, Any]) -> Model:
     entry = find_model(name)
+    arguments = {**entry.settings, **settings}
     try:
-        inspect.signature(entry.construct).bind(**{**entry.settings, **settings})
-    except TypeError as error:
         parameters = inspect.signature(entry.construct).parameters
+    except (TypeError, ValueError) as error:
+        raise InputError(f"model '{name}': {_FACTORY}, found one without a signature: {error}") from error
+    try:
+        inspect.signature(entry.construct).bind(**arguments)
+    except TypeError as error:
         required = [each.name for each in parameters.values() if _is_required(each) and each.name not in settings]
         if ":" in name and required:
             raise InputError(
@@ -177,16 +194,15 @@ def _build_model(name: str, settings: dict[str, Any]) -> Model:
                 f"a function that returns it, or else default values, or settings: '{name}({required[0]}=...)'"
             ) from error
         raise InputError(f"model '{name}': {error}; it takes {', '.join(parameters) or 'no settings'}") from error
-    if ":" not in name:
-        return as_model(entry.construct(**{**entry.settings, **settings}))
+    if entry.of_zoo:
+        return as_model(entry.construct(**arguments))
     try:
-        return as_model(entry.construct(**settings))
+        with refused(f"model '{name}': the factory fails"):
+            return as_model(entry.construct(**arguments))
     except InputError as error:
         if not str(error).startswith("model: "):
             raise
         raise InputError(f"model '{name}': {str(error).removeprefix('model: ')}") from error
-    except Exception as error:
-        raise InputError(f"model '{name}': the factory fails: {in_one_line(error)}") from error
 
 
 def _is_required(parameter: inspect.Parameter) -> bool:
@@ -195,8 +211,8 @@ def _is_required(parameter: inspect.Parameter) -> bool:
 
 
 def _of_factory(name: str, factory: Any) -> Entry:
-    # A module can be called, but with images.
-    if isinstance(factory, nn.Module) or not callable(factory):
+    # A module can be called, but with images; a function of the interpreter returns no model.
+    if isinstance(factory, nn.Module | BuiltinFunctionType) or not callable(factory):
         found = type(factory).__name__
         raise InputError(f"model '{name}': {_FACTORY}, found an object of type {found}; add a function that returns it")
     return Entry(factory, {}, (factory.__doc__ or "").strip().partition("\n")[0])
@@ -211,14 +227,34 @@ def _import_pages() -> None:
             importlib.import_module(f"{room}.{page.name}")
 
 
+@dataclass(frozen=True)
+class _Offered:
+    """The entry points of installed packages in the group ``mcdenoise.models`` by name, and what is wrong with them."""
+
+    points: dict[str, EntryPoint] = field(default_factory=dict)
+    troubles: list[str] = field(default_factory=list)
+
+
 @functools.cache
-def _installed() -> dict[str, Any]:
-    """Entry points of installed packages in the group ``mcdenoise.models``."""
-    return {point.name: point for point in entry_points(group=GROUP)}
+def _offered() -> _Offered:
+    found = _Offered()
+    for package in distributions():
+        # A package that cannot be read is in the way of no other, so each is read by itself.
+        try:
+            points = [point for point in package.entry_points if point.group == GROUP]
+        except Exception as error:
+            found.troubles.append(f"{_named(package)}: entry points cannot be read: {in_one_line(error)}")
+            continue
+        for point in points:
+            # If there are two versions of a package, the one that Python finds first counts.
+            found.points.setdefault(point.name, point)
+    return found
 
 
-def _loaded_entry_point(name: str) -> Any:
+def _named(package: Distribution | None) -> str:
+    """The name of an installed package, or the place of one whose metadata is damaged."""
     try:
-        return _installed()[name].load()
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"model '{name}': its package offers it and cannot load it: {error}") from error
+        name = None if package is None else package.metadata["Name"]
+    except Exception:
+        name = None
+    return str(name or getattr(package, "_path", "that"))

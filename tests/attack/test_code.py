@@ -127,3 +127,46 @@ def test_weights_of_ones_own_model_are_loaded_with_its_factory(
     assert run(f"evaluate {small_sequence} --model {name}(weights={file})")[0] == 0
     assert run(f"calibrate {name}(weights={file}) {small_sequence} -o calibrated.safetensors")[0] == 0
     assert describe_weights(here / "calibrated.safetensors")["architecture"] == "own.py:make"
+
+
+EXITS = {
+    "at its import": "import sys\nsys.exit(0)",
+    "in its factory": "import sys\n\n\ndef make():\n    sys.exit(0)",
+    "in a step": "import sys\n\n\ndef make():\n    def own(color):\n        sys.exit(0)\n\n    return own",
+    "with a word": "def make():\n    raise SystemExit('all is well')",
+    "by no exception": "class End(BaseException): ...\n\n\ndef make():\n    raise End",
+}
+
+
+@pytest.mark.parametrize("source", EXITS.values(), ids=EXITS)
+@pytest.mark.parametrize(
+    "line",
+    [
+        "denoise {shot} -o out --model own.py:make",
+        "evaluate {shot} --model own.py:make",
+        "export own.py:make -o out.pt2 --buffers color",
+        "stability own.py:make",
+    ],
+)
+def test_a_model_that_exits_ends_no_command_with_success(
+    line: str, source: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
+) -> None:
+    (here / "own.py").write_text(source)
+    status, said = run(line.format(shot=small_sequence))
+    assert status in (1, 2), said
+    assert "Traceback" not in said
+    assert not list(here.glob("out*/*.exr"))
+    if not line.startswith("stability"):
+        assert (status, said.count("\n")) == (2, 1), said
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["builtins:exit", "os:abort", "sys:exit", "os:_exit", "subprocess:run(args=touch)", "torch:rand", "torch:nn"],
+)
+def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(
+    name: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
+) -> None:
+    status, said = run(f"denoise {small_sequence} -o out --model {name}")
+    assert (status, said.count("\n")) == (2, 1), said
+    assert not (here / "out").exists()
