@@ -50,6 +50,7 @@ def without_fireflies(frame: Frame) -> Frame:
     common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
     limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
     before, after = (image.sum(1, keepdim=True) for image in (light, incoming(light, None, limit, compared=False)))
-    # A quotient of equal numbers is exactly 1.
-    factor = torch.where(before > 0, after / before, 1)
+    # A quotient of equal numbers is exactly 1. The derivative of 0 / 0 would be NaN.
+    lit = before > 0
+    factor = torch.where(lit, after / torch.where(lit, before, 1), 1)
     return frame.replace(color=(frame.color * factor).to(frame.color.dtype))

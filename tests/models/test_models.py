@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import re
 from collections.abc import Callable
@@ -34,6 +35,7 @@ from mcdenoise.models import (
     load_weights,
     overview,
     parts_of,
+    prepared,
     pretrained_models,
     register_model,
     save_weights,
@@ -42,6 +44,9 @@ from mcdenoise.models import (
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8
 MODELS = list_models()
+# Of those there are no weights: random ones make no image.
+UNTRAINED = [name for name in MODELS if name.startswith("pyramid") or name == "wskp_unet"]
+DIFFERENTIABLE: dict[str, dict[str, Any]] = {"oidn_temporal": {"engine": "torch"}}
 FAMILY = ["cascaded_v2", "cascaded_v2_micro", "cascaded_v2_small", "cascaded_v2_tiny"]
 SIZES = [(1, 1), (5, 7), (17, 33)]
 
@@ -220,6 +225,102 @@ def test_a_gradient_reaches_every_parameter(name: str) -> None:
         assert parameter.grad is not None, key
         assert torch.isfinite(parameter.grad).all(), key
         assert parameter.grad.abs().max() > 0, key
+
+
+def hostile(model: Any, number: int) -> Frame:
+    """A frame with black, saturated and even pixels, without albedo and hits at places; the fourth one is black."""
+    frame = whole_frame(model, 24, 40, seed=number)
+
+    def changed(name: str, image: Tensor) -> Tensor:
+        image = image.clone()
+        if name in RADIANCE or name == "samples":
+            image[..., 2:5, 2:9], image[..., 8:12, 10:18], image[..., 13, :] = 0, 0.5, 1e-30
+            image[..., 6, 3], image[..., 7, 12], image[..., 0, 0, 0] = 1e4, 6e4, 0
+            image[..., 24 - 8 * number :, :] = 0
+        elif name == "depth":
+            image[..., 3:6, :], image[..., 10, 10], image[..., 12:14, 5:9] = torch.inf, 0, 3
+        elif name in ("albedo", "normal", "specular_albedo", "roughness", "alpha"):
+            image[..., 4:7, :], image[..., 12, 12] = 0, 1
+        elif name == "motion":
+            image[..., 9:, :], image[..., 0, :] = 0, 100
+        return image
+
+    given = [name for name in frame.buffers if name != "view_projection" and name not in frame.extra]
+    return frame.replace(**{name: changed(name, getattr(frame, name)) for name in given})
+
+
+@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn"}))
+def test_gradients_of_hostile_frames_are_finite(name: str) -> None:
+    """In all buffers of four frames, the last of which is black, and in all weights."""
+    model, state, loss = small(name, **DIFFERENTIABLE.get(name, {})), None, torch.zeros(())
+    leaves: dict[str, Tensor] = dict(model.named_parameters())
+    for number in range(4):
+        frame = hostile(model, number)
+        given = {key: image.requires_grad_() for key, image in frame.items() if key not in frame.extra}
+        leaves |= {f"{key} of frame {number}": image for key, image in given.items()}
+        output, state = model(frame, state)
+        for image in (output.image, *output.stages.values()):
+            assert torch.isfinite(image).all()
+            loss = loss + (image * torch.linspace(0.5, 1.5, 40)).mean()
+    leaves = {key: leaf for key, leaf in leaves.items() if leaf.requires_grad}
+    found = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+    for key, gradient in zip(leaves, found, strict=True):
+        assert gradient is None or torch.isfinite(gradient).all(), key
+    assert found[list(leaves).index("color of frame 0")] is not None
+
+
+@pytest.mark.parametrize("name", ["oidn_tuned_small", "svgf", "guided", "joint_bilateral"])
+def test_gradients_are_those_of_difference_quotients(name: str) -> None:
+    """Of a first frame in float64, along a direction that leaves black pixels and the largest ones as they are."""
+    model = create_model(name, pretrained=name in pretrained_models()).double().eval()
+    frame = whole_frame(model, 24, 40).to(torch.float64)
+    frame.color[..., 3:9, 4:20] = 0
+    # An exposure, which has no derivative by design, stays that of the frame.
+    frame = prepared(model, frame)
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.randn(1, 3, 24, 40, dtype=torch.float64, generator=generator) * frame.color
+    direction = torch.where(frame.color < frame.color.amax() / 2, direction, 0)
+
+    def total(color: Tensor) -> Tensor:
+        return (model(frame.replace(color=color))[0].image * torch.linspace(0.5, 1.5, 40)).sum()
+
+    leaf = frame.color.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(total(leaf), leaf)
+    with torch.no_grad():
+        apart = [total(frame.color + sign * 1e-6 * direction) for sign in (1, -1)]
+    expected = float(apart[0] - apart[1]) / 2e-6
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5)
+
+
+def even(height: int, width: int, model: Any) -> Frame:
+    """A constant image with constant features; positions are those of a wall."""
+    color = torch.tensor([0.8, 0.4, 0.2]).reshape(1, 3, 1, 1).expand(1, 3, height, width).clone()
+    frame = whole_frame(model, height, width)
+    given: dict[str, Tensor] = {"albedo": torch.full_like(color, 0.5), "depth": torch.full_like(color[:, :1], 2)}
+    given |= {name: color.clone() for name in RADIANCE if name in frame.buffers}
+    if frame.samples is not None:
+        given["samples"] = color[:, None].expand_as(frame.samples).clone()
+    if "length" in frame.buffers:
+        given["length"] = torch.ones_like(color[:, :1])
+    return frame.replace(**given)
+
+
+@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn", *UNTRAINED}))
+@torch.no_grad()
+def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
+    """Up to its borders: it varies by little more than far from them, and has the level that it has there."""
+    plain = {"restore": False} if "restore" in inspect.signature(find_model(name).construct).parameters else {}
+    model = create_model(name, pretrained=name in [*pretrained_models(), *compared_models()], **plain).eval()
+
+    def ratios(height: int, width: int) -> Tensor:
+        frame = even(height, width, model)
+        return model(frame)[0].image / frame.color
+
+    far = ratios(192, 192)[..., 64:128, 64:128]
+    level = far.mean((2, 3), keepdim=True)
+    bound = 0.025 + 2 * float((far - level).abs().max())
+    for size in ((1, 1), (1, 7), (3, 5), (16, 16), (17, 31), (33, 1), (96, 128)):
+        assert float((ratios(*size) / level - 1).abs().max()) < bound, size
 
 
 @pytest.mark.parametrize("name", TRAINABLE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from mcdenoise.frame import Skip
 from mcdenoise.models import Exposed, FromBuffers, Needs, Region, Tiled, parts_of, prepared
 from mcdenoise.models._memory import Frames, Memory, Network, Tiling
 from mcdenoise.models.tiled import regions
+from mcdenoise.ops._window import mirrored
 
 BUFFERS = frozenset({"color", "albedo", "normal", "depth"})
 CPU = torch.device("cpu")
@@ -212,7 +214,7 @@ def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int)
     mask[..., top : top + 60, left : left + 70] = False
     for tiled in parts_of(small(name).to(memory_format=torch.channels_last), Tiled):
         given = prepared(tiled, frame)
-        whole = tiled.inner(given)[0].image
+        whole = tiled(given)[0].image
         part = tiled(given.replace(skip=Skip(mask, {"image": frame.color})))[0].image
         # Convolutions choose the order of their sums by the size of the image and the number of threads.
         scale, needed = float(whole.abs().mean()), ~mask[0, 0]
@@ -224,6 +226,26 @@ def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int)
             patch.setattr(Tiled, "halo", 24)
             part = tiled(given.replace(skip=Skip(mask, {"image": frame.color})))[0].image
         assert (whole - part)[..., needed].abs().max() > 1e-4 * scale
+
+
+@torch.no_grad()
+def test_around_the_image_a_network_sees_its_mirror_image() -> None:
+    """As if the image were larger; in training it does not."""
+    frame, (model,) = frame_of(40, 56), parts_of(small("kpcn"), Tiled)
+    border = model.halo
+    larger = prepared(model, frame).map(lambda image: mirrored(image, (border, border), (border, border)))
+    expected = model.inner(larger)[0].image[..., border:-border, border:-border]
+    model.border = border
+    torch.testing.assert_close(model(frame)[0].image, expected)
+    assert not torch.allclose(model.train()(frame)[0].image, expected)
+    assert torch.equal(model(frame)[0].image, model.inner(frame)[0].image)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (20, 30)])
+def test_a_mirror_image_goes_on_for_ever(size: tuple[int, int]) -> None:
+    image = torch.rand(2, *size, dtype=torch.float64)
+    expected = np.pad(image.numpy(), [(0, 0), (16, 21), (3, 40)], mode="symmetric")
+    assert np.array_equal(mirrored(image, (16, 21), (3, 40)).numpy(), expected)
 
 
 # Rectangles
