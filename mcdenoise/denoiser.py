@@ -50,6 +50,7 @@ from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
+from mcdenoise.models._wrapper import name_of
 from mcdenoise.noise import noise_of
 from mcdenoise.sampling import has_exact_features
 
@@ -208,7 +209,7 @@ class Denoiser:
         if precision not in known:
             raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
         self.keep_all, self.differentiable, self.alpha = keep_all, differentiable, alpha
-        of_zoo = isinstance(model, str) and ":" not in model
+        name, of_zoo = str(model), isinstance(model, str) and ":" not in model
         if isinstance(model, str):
             _check_settings(model, settings)
             model = create_model(model, pretrained=weights is None, weights=weights, **settings)
@@ -220,6 +221,7 @@ class Denoiser:
             # Channels-last convolutions are about 1.5 times faster on a CPU.
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.model = as_model(model)
+        self._name = name if of_zoo else name_of(self.model)
         self.precision, self._why_precision = self._chosen(precision, of_zoo=of_zoo)
         if self.precision == "int8":
             if differentiable:
@@ -371,7 +373,7 @@ class Denoiser:
                 drop_pages()
             noisy = frame.color
             precision = computing_in(self.precision, self.device)
-            with precision, self._explained(dtype), timed("model", self.device, unless_detailed=True):
+            with precision, self._explained(dtype), timed(self._name, self.device):
                 output, state = checked_step(self.model, frame, self._state, self._shape)
             with timed("validate", self.device):
                 # A renderer may write its next frame into the same buffers, and a user may change an image in place.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, Stage, Tiled, parts_of, save_weights
 from mcdenoise.models.cascaded_v2 import PixelNetwork
 
-STAGES = ["validate", "accumulate", "plan", "network", "remodulate", "restore"]
+STAGES = ["validate", "accumulate", "plan", "network", "remodulate", "restore", "Chain"]
 
 
 def small_model() -> nn.Module:
@@ -457,7 +458,7 @@ def test_the_report_of_a_frame(frames: list[Frame]) -> None:
     denoiser = Denoiser(Keep())
     denoiser(frames[0])
     assert denoiser.report.stages == {}
-    assert list(denoiser.report.milliseconds) == ["validate", "model"]
+    assert list(denoiser.report.milliseconds) == ["validate", "Keep"]
 
 
 def test_history_is_of_use_to_more_than_one_frame_that_tells_motion() -> None:
@@ -540,3 +541,26 @@ def test_depth_comes_from_positions_and_camera(small_sequence: Path) -> None:
         torch.testing.assert_close(derived[hit], frame.depth[hit], rtol=1e-3, atol=0)
         assert image.isfinite().all()
         assert expected.shape == image.shape
+
+
+def test_a_model_of_ones_own_is_timed_under_its_name_in_any_wrapper(frames: list[Frame]) -> None:
+    class Slow(nn.Module):
+        def forward(self, color: Tensor) -> Tensor:
+            time.sleep(0.03)
+            return color
+
+    class SlowStep(Mean):
+        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
+            time.sleep(0.03)
+            return super().forward(frame, state)
+
+    for model, name in ((Slow(), "Slow"), (SlowStep(), "SlowStep")):
+        for wrapped in (model, Demodulated(model), Chain(first=create_model("noisy"), second=Slow())):
+            denoiser = Denoiser(wrapped)
+            start = time.perf_counter()
+            denoiser(frames[0])
+            whole = (time.perf_counter() - start) * 1e3
+            times = denoiser.report.milliseconds
+            # A sleep is never shorter than it was asked for, and nothing is counted twice.
+            assert times["Slow" if isinstance(wrapped, Chain) else name] >= 30
+            assert sum(times.values()) <= whole

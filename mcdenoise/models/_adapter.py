@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._journal import timed
 
 CONTRACT = (
     "expected a model with `needs` that takes (frame, state) and returns (Output, state), or a module or function that "
@@ -42,7 +43,7 @@ class FromBuffers(nn.Module):
                 continue
             (required if parameter.default is parameter.empty else optional).add(parameter.name)
         if not required | optional or "frame" in required:
-            raise InputError(f"model: {CONTRACT}; found {_name(function)}{inspect.signature(call)}")
+            raise InputError(f"model: {CONTRACT}; found {name_of_object(function)}{inspect.signature(call)}")
         trainable = isinstance(function, nn.Module) and any(True for _ in function.parameters())
         self._needs = Needs(frozenset(required), frozenset(optional), trainable, reach)
 
@@ -59,15 +60,16 @@ class FromBuffers(nn.Module):
         """
         if absent := self._needs.missing(frame):
             raise MissingBufferError(
-                f"buffer '{absent[0]}': {_name(self.function)} takes it, found only "
+                f"buffer '{absent[0]}': {name_of_object(self.function)} takes it, found only "
                 f"{', '.join(sorted(frame.buffers))}; render it, or give that argument a default value"
             )
         named = {name: frame.buffer(name) for name in sorted(self._needs.buffers | self._needs.uses)}
-        result = self.function(**{name: image for name, image in named.items() if image is not None})
+        with timed(name_of_object(self.function), frame.color.device):
+            result = self.function(**{name: image for name, image in named.items() if image is not None})
         if isinstance(result, Output):
             return result, None
         if not isinstance(result, Tensor):
-            raise InputError(f"model: {CONTRACT}; {_name(self.function)} returned {type(result).__name__}")
+            raise InputError(f"model: {CONTRACT}; {name_of_object(self.function)} returned {type(result).__name__}")
         return Output(result), None
 
 
@@ -86,5 +88,6 @@ def as_model(thing: Any) -> Model:
     return FromBuffers(thing)
 
 
-def _name(thing: Any) -> str:
+def name_of_object(thing: Any) -> str:
+    """The name of a function, or of an object's class."""
     return str(getattr(thing, "__name__", type(thing).__name__))

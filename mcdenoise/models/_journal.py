@@ -65,7 +65,7 @@ class Journal:
     """The report of one frame. For a frame on a GPU it is complete after :meth:`settle`.
 
     Args:
-        milliseconds: run time of each stage.
+        milliseconds: run time of each stage; under the model's name what it spends outside of its stages.
         stages: how much of each stage was skipped, and why, by name.
         reset: why the history was discarded; empty if it was used.
         tiles: how the image was divided into tiles, and why.
@@ -90,8 +90,8 @@ class Journal:
         self.stages[name] = Stage(name, float(skipped), reason, exact)
 
     @contextmanager
-    def timed(self, stage: str, device: torch.device, *, unless_detailed: bool = False) -> Iterator[None]:
-        """See :func:`timed`; with ``unless_detailed`` the stage counts only if nothing is timed inside it."""
+    def timed(self, stage: str, device: torch.device) -> Iterator[None]:
+        """See :func:`timed`."""
         watch = Stopwatch(device)
         span = _Span(stage, watch, watch.mark())
         self._open.append(span)
@@ -101,9 +101,7 @@ class Journal:
             self._open.pop()
         span.end = watch.mark()
         if self._open:
-            self._open[-1].within += span.within if unless_detailed and span.within else [span]
-        if unless_detailed and span.within:
-            return
+            self._open[-1].within.append(span)
         self._spans.append(span)
         if not watch.runs_behind:
             self._add_times()
@@ -199,17 +197,16 @@ def tell_history(fraction: Tensor) -> None:
     ask(fraction, tell)
 
 
-def timed(stage: str, device: torch.device, *, unless_detailed: bool = False) -> AbstractContextManager[None]:
+def timed(stage: str, device: torch.device) -> AbstractContextManager[None]:
     """Measure the run time of a stage. A stage that is timed inside it counts separately.
 
     Args:
         stage: its name.
         device: where it runs. The host does not wait for a GPU: the GPU records the time itself, which is read when the
             journal is settled.
-        unless_detailed: whether the stage counts only if nothing is timed inside it.
     """
     found = journal()
-    return nullcontext() if found is None else found.timed(stage, device, unless_detailed=unless_detailed)
+    return nullcontext() if found is None else found.timed(stage, device)
 
 
 def summarize(frames: list[list[Stage]]) -> list[dict[str, Any]]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._adapter import as_model
+from mcdenoise.models._adapter import FromBuffers, as_model, name_of_object
 from mcdenoise.models._interface import Model, Needs, Output, State
 
 _Wanted = TypeVar("_Wanted")
@@ -55,6 +55,14 @@ def run(model: Model, handed: list[Frame], state: State) -> tuple[Output, State]
     step = model.forward if isinstance(model, nn.Module) else model
     found: tuple[Output, State] = step(handed.pop(), state)
     return found
+
+
+def name_of(model: Model) -> str:
+    """The name of the class or function that is inside all wrappers of a model."""
+    inner: Any = model
+    while isinstance(inner, Wrapper):
+        inner = inner.inner
+    return name_of_object(inner.function if isinstance(inner, FromBuffers) else inner)
 
 
 def parts_of(model: Model, kind: type[_Wanted]) -> Iterator[_Wanted]:

@@ -275,15 +275,11 @@ def test_stages_are_timed_without_waiting(monkeypatch: pytest.MonkeyPatch) -> No
         for _ in range(2):
             with timed("inner", device):
                 time.sleep(0.03)
-        with timed("silent", device, unless_detailed=True), timed("told", device):
-            time.sleep(0.01)
-        with timed("telling", device, unless_detailed=True):
-            time.sleep(0.01)
     whole = (time.perf_counter() - start) * 1e3
     assert (Event.waits, found.milliseconds) == (0, {})
     found.settle()
     assert Event.waits > 0
-    assert set(found.milliseconds) == {"outer", "inner", "told", "telling"}
+    assert set(found.milliseconds) == {"outer", "inner"}
     # Each counts what is its own; a sleep is never shorter than it was asked for.
     assert found.milliseconds["outer"] >= 20
     assert found.milliseconds["inner"] >= 60
