@@ -577,8 +577,7 @@ def _refuse_illegal(name: str, count: int, place: str = "") -> None:
     advice = "set them to inf where there is none" if spec.infinite else "render the buffer again"
     raise InputError(
         f"buffer '{name}': expected {expected} ({spec.meaning}), "
-        f"found {count} {'NaN or -inf' if spec.infinite else 'NaN or infinite'} ones{place}; "
-        f"{advice}, or leave the buffer out"
+        f"found {count} NaN or infinite ones{place}; {advice}, or leave the buffer out"
     )
 
 
