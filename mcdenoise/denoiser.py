@@ -469,11 +469,11 @@ def suitable_model(frame: Frame | None, *, still: bool = False, cascade: bool = 
     Args:
         frame: ``None`` for one that is known to have features through a filter.
         still: whether it is the only frame of its shot.
-        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter layers with.
+        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter alpha with.
     """
     exact = frame is not None and has_exact_features(frame)
     if cascade:
-        return DEFAULT if exact else "cascaded_v3", "layers, alpha or settings of the history require a cascade"
+        return DEFAULT if exact else "cascaded_v3", "of the usual models, only cascades have kernels for alpha and settings of the history"
     name, reason = FILTERED, "features may be noisy, or filtered over pixels"
     if frame is not None and exact:
         if not still and float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
@@ -508,7 +508,7 @@ def denoise(
         albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
-        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if layers, weights or settings are passed;
+        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if weights or settings are passed;
             otherwise that of :func:`mcdenoise.denoiser.suitable_model`.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
@@ -534,8 +534,8 @@ def denoise(
     buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
     if model is None:
-        # Weights and settings are those of the default, and layers are filtered with its kernels.
-        model = DEFAULT if settings or frame.layers else suitable_model(frame, still=True)[0]
+        # Weights and settings are those of the default.
+        model = DEFAULT if settings else suitable_model(frame, still=True)[0]
     _check_settings(model, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)

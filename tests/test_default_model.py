@@ -55,6 +55,8 @@ def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> No
     sequence = replace(open_sequence(small_sequence), layout="files")
     for settings, model in (
         (ShotSettings(), "oidn_tuned"),
+        # Any model's image is split into layers.
+        (ShotSettings(layers=("all",)), "oidn_tuned"),
         (ShotSettings(alpha=True), "cascaded_v3"),
         (ShotSettings(alpha_min=0.5), "cascaded_v3"),
         (ShotSettings(tolerance=0.0), "cascaded_v3"),
