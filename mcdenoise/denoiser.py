@@ -473,7 +473,10 @@ def suitable_model(frame: Frame | None, *, still: bool = False, cascade: bool = 
     """
     exact = frame is not None and has_exact_features(frame)
     if cascade:
-        return DEFAULT if exact else "cascaded_v3", "of the usual models, only cascades have kernels for alpha and settings of the history"
+        return (
+            DEFAULT if exact else "cascaded_v3",
+            "of the usual models, only cascades have kernels for alpha and settings of the history",
+        )
     name, reason = FILTERED, "features may be noisy, or filtered over pixels"
     if frame is not None and exact:
         if not still and float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:

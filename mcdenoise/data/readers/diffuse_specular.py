@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import Light, color_of
+from mcdenoise.data.readers.lights import Light, color_of, find_parts
 from mcdenoise.frame import LARGEST_RADIANCE
 
 DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission", "specular_albedo"
@@ -66,6 +66,8 @@ _KNOWN = {title for diffuse, others, _ in _RENDERERS for title in (*diffuse, *ot
 _ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
 # Largest fraction of pixels that do not add up, such as those brighter than the largest half float.
 _MOST_OFF = 1e-3
+# Every so manyth column is looked at to find out which layers are parts.
+_STEP = 8
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 
 
@@ -106,6 +108,17 @@ class Split:
                 number += 1
             lights[name] = total
         return lights
+
+    def without_strangers(self, images: Mapping[str, Image], color: Image) -> Split:
+        """The same without lights that are not in the color, such as the sky of a transparent film, by their values."""
+        lights = {f"{name} {i}": each for name, own in self.parts.items() for i, each in enumerate(own)}
+        pixels = {}
+        for number, (name, light) in enumerate(lights.items()):
+            found = [images[f"light {number} {j}"] for j in range(len(light.layers))]
+            pixels[name] = light.radiance(found)[:, ::_STEP].reshape(-1, 3)
+        kept = find_parts(color[:, ::_STEP].reshape(-1, 3), pixels, {})
+        parts = {name: tuple(lights[n] for n in kept if n.startswith(f"{name} ")) for name in self.parts}
+        return replace(self, parts=parts) if all(parts.values()) else self
 
     def off(self, sums: Mapping[str, Image], color: Image) -> tuple[float, float]:
         """Apply :func:`off` to the parts."""

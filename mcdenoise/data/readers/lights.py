@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import numpy as np
 
+from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import Image, Mask
 from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
@@ -24,7 +25,7 @@ _DIVIDED = {
     for kind in kinds
     for way in ways
 }
-# Additive layers of Blender, Arnold, RenderMan, V-Ray and LuxCore, for ``all``.
+# Additive layers of Blender, Arnold, RenderMan, V-Ray and LuxCore, which ``all`` tries first.
 _ADDED = {
     *_DIVIDED,
     *("Emit", "Env", "VolumeDir", "VolumeInd", "Emission", "Environment", "Volume Direct", "Volume Indirect"),
@@ -43,9 +44,15 @@ _ADDED = {
     *("DIRECT_DIFFUSE", "DIRECT_GLOSSY", "EMISSION", "INDIRECT_DIFFUSE", "INDIRECT_GLOSSY", "INDIRECT_SPECULAR"),
 }
 
-
+_MATTES = ("Crypto", "crypto", "Debug", "Index", "Material Index", "Object Index")
 # Smallest color by which light is divided.
 _DARKEST = 1e-3
+# Fraction of a layer's light that must be missing without it. The rest is rounding and loss of compression.
+_MISSING = 0.9
+# Largest difference of layers that add up, and of a copy of the color, relative to the light of the color.
+WHOLE, _COPY = 0.01, 0.1
+# Number of sets of layers to try.
+_MOST_SETS = 4096
 
 
 @dataclass(frozen=True)
@@ -93,10 +100,79 @@ def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool
     return {name: (radiance * scale).astype(np.float32) for name, radiance in held.items()}
 
 
+def left_of(color: Image, parts: Sequence[Image]) -> float:
+    """The difference of a color and the sum of its parts, ``(N, 3)`` each, relative to the color."""
+    with np.errstate(all="ignore"):
+        left = np.abs(color - np.sum(parts, 0, dtype=np.float64))
+        known = np.isfinite(left)
+        return float(left[known].sum() / max(np.abs(color[known]).sum(dtype=np.float64), 1e-30))
+
+
+def find_parts(color: Image, known: Mapping[str, Image], unknown: Mapping[str, Image]) -> list[str]:
+    """Choose the layers that add up to the color, by their values.
+
+    A layer can be a part if nearly all of its light is missing without it. Of the sets of such layers the first that is
+    complete is taken: those with known names and with many layers are tried first. If none is complete, the parts are
+    the layers with known names, since others may be anything.
+
+    Args:
+        color: ``(N, 3)`` some pixels of the color.
+        known: the same pixels of layers with names of light.
+        unknown: likewise, with other names.
+    """
+    with np.errstate(all="ignore"):
+        images = {name: image.astype(np.float64) for name, image in {**known, **unknown}.items()}
+        # What is no light may have NaN anywhere; light has it in few pixels.
+        broken = {name: ~np.isfinite(image).all(-1) for name, image in images.items()}
+        usable = np.isfinite(color).all(-1)
+        usable &= ~np.any([each for each in broken.values() if each.mean() < _COPY] or [~usable], axis=0)
+        # All pixels count, however bright a few of them are.
+        total = np.abs(color[usable]).sum(-1, keepdims=True)
+        weight = 1 / (total + np.median(total) + 1e-30)
+        left = color[usable] * weight
+        images = {name: image[usable] * weight for name, image in images.items()}
+    light = max(float(np.abs(left).sum()), 1e-30)
+    # Unknown layers are neither black, nor the color itself in another layer, perhaps without its noise.
+    order = [n for n in images if n in known or (images[n].any() and np.abs(left - images[n]).sum() > _COPY * light)]
+    lights = np.array([np.abs(images[name]).sum() for name in order])
+    # The light of a layer and of all after it.
+    coming = [float(np.nansum(lights[i:])) for i in range(len(order) + 1)]
+
+    def without(rest: Array, place: int) -> Array | None:
+        after: Array = rest - images[order[place]]
+        gain = np.abs(rest).sum() - np.abs(after).sum()
+        # A faint layer with a known name may be less than the rounding of the others.
+        least = _MISSING * lights[place] - (WHOLE / 10 * light if order[place] in known else 0)
+        return after if gain >= least else None
+
+    stack: list[tuple[Array, int, list[str]]] = [(left, 0, [])]
+    first: list[str] | None = None
+    for _ in range(_MOST_SETS):
+        if not stack:
+            break
+        rest, place, names = stack.pop()
+        if first is None and place == len(known):
+            first = names
+        far = float(np.abs(rest).sum()) - WHOLE * light
+        if place == len(order):
+            if far <= 0:
+                return names
+        elif first is None or far <= coming[place]:
+            after = without(rest, place)
+            stack.append((rest, place + 1, names))
+            if after is not None:
+                stack.append((after, place + 1, [*names, order[place]]))
+    return first or []
+
+
 def is_light(layer: Layer) -> bool:
     """Whether a layer is known as light, as a color that light is divided by, or as neither (object mattes)."""
-    colors, mattes = set(_DIVIDED.values()), ("Crypto", "Debug", "Index", "Material Index", "Object Index")
-    return layer.title in _ADDED | colors or layer.title.startswith(("Combined_", *mattes))
+    return layer.title in _ADDED or layer.title.startswith("Combined_") or _is_other(layer)
+
+
+def _is_other(layer: Layer) -> bool:
+    """Whether a layer of colors is known to be no light: a color that light is divided by, or an object matte."""
+    return layer.title in _DIVIDED.values() or layer.title.startswith(_MATTES)
 
 
 def color_of(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
@@ -104,24 +180,44 @@ def color_of(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
     return [each for each in layers if each.title == _DIVIDED.get(layer.title) and each.family == layer.family][:1]
 
 
-def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequence[str]) -> Mapping[str, Light]:
+def find_lights(
+    where: str,
+    layers: Sequence[Layer],
+    color: Layer,
+    names: Sequence[str],
+    read: Callable[[Sequence[Layer]], Mapping[Layer, Image]],
+) -> tuple[Mapping[str, Light], float | None]:
     """Find the requested layers of light.
 
     Args:
         where: description of the files, for messages.
         layers: all layers of a frame.
         color: layer of the color; it determines the view layer.
-        names: names or patterns such as ``Combined_*``; ``all`` for all known additive layers.
+        names: names or patterns such as ``Combined_*``; ``all`` for those that add up to the color.
+        read: reads the same pixels of several layers, ``(N, 3)`` each, of those that have the pixels of the color.
+
+    Returns:
+        The lights by name, and the fraction of the light of the color that is in none of them; ``None`` if there are
+        none, or some have other pixels.
 
     Raises:
         InputError: a layer does not exist, or has fewer than three channels.
     """
     own = [layer for layer in layers if (layer.family == color.family or layer.anonymous) and layer != color]
     known = [layer for layer in own if layer.is_color and recognise(layer) is None]
+    pixels = read([color, *known, *(each for layer in known for each in color_of(layer, own))]) if names else {}
+
+    def radiance(chosen: Sequence[Layer]) -> dict[str, Image]:
+        """The pixels of lights, as far as they have been read."""
+        parts = [(layer, *color_of(layer, own)) for layer in chosen]
+        return {each[0].name: Light(each).radiance([pixels[p] for p in each]) for each in parts if {*each} <= {*pixels}}
+
     expanded: list[str] = []
     for name in names:
         if name == ALL:
-            expanded += [layer.name for layer in known if layer.title in _ADDED]
+            lit = [layer for layer in known if layer.title in _ADDED]
+            others = [layer for layer in known if layer not in lit and not _is_other(layer)]
+            expanded += find_parts(pixels[color], radiance(lit), radiance(others))
         elif any(mark in name for mark in "*?["):
             expanded += [layer.name for layer in known if fnmatchcase(layer.title, name)]
         else:
@@ -146,4 +242,6 @@ def find_lights(where: str, layers: Sequence[Layer], color: Layer, names: Sequen
             )
         (layer,) = found
         lights[layer.name] = Light((layer, *color_of(layer, own)))
-    return lights
+    images = radiance([light.layers[0] for light in lights.values()])
+    whole = bool(lights) and images.keys() == lights.keys()
+    return lights, left_of(pixels[color], [*images.values()]) if whole else None

@@ -27,9 +27,10 @@ from mcdenoise.data.readers.diffuse_specular import (
 )
 from mcdenoise.data.readers.files import RenderedFiles, hit, seen_of, world_to_camera
 from mcdenoise.data.readers.layers import Layer, layers_of, recognise
-from mcdenoise.data.readers.lights import find_lights
+from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, mean_is, split_samples
+from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import (
     MOTION_PAIRS,
     USUAL_MOTION,
@@ -45,6 +46,8 @@ from mcdenoise.noise import noise_is_spread
 
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
+# Strips of rows, and the columns in them, in which layers are compared with the color.
+_STRIPS, _STRIP, _COLUMNS = 8, 8, 128
 # Features that make most methods better, of which a frame has at least one where there are any.
 _FEATURES = {"albedo", "normal", "depth"}
 # Smallest motion in pixels that shows a moving camera.
@@ -93,10 +96,12 @@ def open_files(
     numbers = choose_numbers(sorted(groups[color.group].files))
     shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {})
     _check(shot)
-    found = find_lights(where, layers, color, lights)
+    found, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
     folder = shot.file(color, numbers[0]).parent
     shot = replace(shot, lights=found, cameras=find_camera_matrices(folder, numbers[-1]))
     _look(shot, color_has_albedo)
+    if left is not None:
+        _look_at_lights(shot, left, chosen=ALL not in lights)
     if shot.color_has_albedo:
         _look_at_parts(shot, splits)
     if samples is not None:
@@ -394,6 +399,42 @@ def _seen_elsewhere(
     return motion_to(matrix, now[1]["position"], known)
 
 
+def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
+    """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
+    color, number = shot.choice.layers["color"], shot.numbers[0]
+    height, width = shot.size
+    main = shot.part(color)
+    same = [each for each in layers if (shot.part(each).size, shot.part(each).origin) == (main.size, main.origin)]
+    wanted = list(dict.fromkeys(layer for layer in same if number in shot.groups[layer.group].files))
+    found: dict[Layer, list[Image]] = {layer: [] for layer in wanted}
+    for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int):
+        for key in {(layer.group, layer.part) for layer in wanted}:
+            own = [layer for layer in wanted if (layer.group, layer.part) == key]
+            channels = [channel for layer in own for channel in layer.channels[:3]]
+            rows = slice(int(top), int(top) + _STRIP)
+            pixels = read_channels(shot.file(own[0], number), {key[1]: channels}, rows)[key[1]]
+            for place, layer in enumerate(own):
+                image = pixels[:, :: max(1, width // _COLUMNS), 3 * place : 3 * place + 3].reshape(-1, 3)
+                found[layer].append(decode(image[None])[0] if shot.part(layer).display_referred else image)
+    return {layer: np.concatenate(strips) for layer, strips in found.items() if strips}
+
+
+def _look_at_lights(shot: RenderedFiles, left: float, *, chosen: bool) -> None:
+    """Say how far the layers of light add up to the color; warn if they do not, unless the user has chosen them."""
+    names = list(shot.lights)
+    if left <= WHOLE:
+        shot.table.append(Row("layers", f"all {len(names)}", "they add up to the color"))
+        return
+    shot.table.append(Row("layers", f"all {len(names)}", f"{left:.1%} of the light is in none: the remainder"))
+    if not chosen:
+        others = [layer.place for layer in shot.choice.unknown if layer.is_color and not is_light(layer)]
+        shot.warnings.append(
+            f"--layers all: {', '.join(names)} add up to the color but for {left:.1%} of its light, which stays in the "
+            "image alone; write the missing layers, too"
+            + (f", or name them, if they are among {', '.join(others[:8])}" if others else "")
+        )
+
+
 def _splits(layers: Sequence[Layer], choice: Choice, mapping: Mapping[str, str]) -> list[Split]:
     """Candidates for diffuse and specular light, unless the user has excluded them."""
     if "" in {mapping.get(DIFFUSE), mapping.get(SPECULAR)}:
@@ -416,7 +457,10 @@ def _look_at_parts(shot: RenderedFiles, splits: Sequence[Split]) -> None:
         off = split.off(sums, read["color"][..., :3])
         if not adds_up(off):
             refused.append((split, off))
-            continue
+            split = split.without_strangers(read, read["color"][..., :3])
+            sums = split.sums(shot.read(number, split.layers))
+            if not adds_up(split.off(sums, read["color"][..., :3])):
+                continue
         shot.split = split
         total = sum(float(np.nansum(each)) for each in sums.values())
         for name, lights in split.parts.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from mcdenoise.data import open_sequence
+from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, save_weights
 
@@ -242,3 +243,105 @@ def test_kpcn_filters_both_parts_of_a_real_file(run: Run, rendered: Path, tmp_pa
     assert status == 0
     said = "kept (diffuse and specular light)" if split else "skipped (these weights are for color alone)"
     assert f"  specular branch: {said}\n" in printed
+
+
+# Layers that add up, chosen from their values
+
+
+def shares(count: int, seed: int = 0) -> list[Any]:
+    """Layers of noisy light with edges in different places."""
+    random = np.random.default_rng(seed)
+    places = (random.random((count, 24, 32, 1)) < 0.7).repeat(2, 1).repeat(2, 2)
+    return list((places * random.gamma(1, 1, (count, 48, 64, 3))).astype(np.float32))
+
+
+def as_channels(layers: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{c}".lstrip("."): image[..., i] for name, image in layers.items() for i, c in enumerate("RGB")}
+
+
+@pytest.mark.parametrize("kind", ["float", "half"])
+def test_all_layers_are_those_that_complete_the_sum(kind: str, save: Callable[..., Path], tmp_path: Path) -> None:
+    diffuse, glossy, coat, sky, lamp = shares(5)
+    copy = diffuse + glossy + coat
+    color = copy + 0
+    random = np.random.default_rng(1)
+    layers = {
+        "": color,
+        "diffuse_direct": diffuse,
+        "specular_indirect": glossy,
+        "coat": 0.1 * coat,
+        # In the file, but not in the color: a transparent film has no sky.
+        "background": sky,
+        "emission": 0 * lamp,
+        # No light.
+        "copy": copy,
+        "clean": color * random.uniform(0.98, 1.02, color.shape),
+        "occlusion": random.random(color.shape),
+        "nothing": 0 * color,
+        "faint": 1e-3 * random.random(color.shape),
+        "crypto_object00": random.random(color.shape),
+        "broken": np.where(sky > 1, np.nan, color),
+    }
+    layers[""] = diffuse + glossy + 0.1 * coat
+    path = save(tmp_path / "a.exr", as_channels(layers), kind)
+    sequence = open_sequence(path, lights=("all",))
+    assert sorted(sequence.lights) == ["coat", "diffuse_direct", "emission", "specular_indirect"]
+    assert not any("--layers" in warning for warning in sequence.warnings)
+    frame = sequence.frame(0)
+    torch.testing.assert_close(sum(frame.layers.values()), frame.color, rtol=4e-3, atol=1e-3)
+
+
+def test_layers_of_any_names_are_chosen_if_they_add_up(save: Callable[..., Path], tmp_path: Path) -> None:
+    sun, sky, lamp = shares(3)
+    groups = {"Sun": sun, "Sky": sky, "Lamp": lamp}
+    color = sun + sky + lamp
+    # The same light divided in another way.
+    fraction = np.random.default_rng(2).random(color.shape).astype(np.float32)
+    others = {"one": color * fraction, "two": color * (1 - fraction)}
+    for layers, expected in (
+        (groups, [*groups]),
+        (others, [*others]),
+        (groups | others, [*groups]),
+        ({"one": others["one"]} | groups | {"two": others["two"]}, None),
+    ):
+        path = save(tmp_path / f"{len(layers)}" / "a.exr", as_channels({"": color} | layers))
+        sequence = open_sequence(path, lights=("all",))
+        assert (
+            sorted(sequence.lights) == sorted(expected) if expected else set(sequence.lights) in ({*groups}, {*others})
+        )
+        frame = sequence.frame(0)
+        torch.testing.assert_close(sum(frame.layers.values()), frame.color)
+
+
+def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
+    diffuse, glossy, coat = shares(3)
+    channels = as_channels({"": diffuse + glossy + coat, "DiffuseThing": diffuse, "diffuse_direct": diffuse})
+    sequence = open_sequence(save(tmp_path / "a.exr", channels), lights=("all",))
+    assert sequence.lights == ["diffuse_direct"]
+    left = (glossy + coat).sum() / (diffuse + glossy + coat).sum()
+    (warning,) = [each for each in sequence.warnings if "--layers" in each]
+    assert f"{left:.1%}" in warning
+    # One that is named is taken, and the remainder is in the table.
+    sequence = open_sequence(tmp_path / "a.exr", lights=("DiffuseThing",))
+    assert not any("--layers" in each for each in sequence.warnings)
+    assert any(row.buffer == "layers" and f"{left:.1%}" in row.reading for row in sequence.table)
+    # Names that nobody knows, and values that do not add up.
+    channels = as_channels({"": diffuse + glossy + coat, "one": diffuse, "two": glossy})
+    assert "found none; name them: --layers one.RGB two.RGB" in refused(
+        open_sequence, save(tmp_path / "b" / "b.exr", channels), lights=("all",)
+    )
+
+
+def test_a_transparent_film_has_no_sky(rendered: Path, save: Callable[..., Path], tmp_path: Path) -> None:
+    path = rendered / "blender" / "shot_0001.exr"
+    names = read_image_header(path).parts[0].channels
+    pixels = dict(zip(names, np.moveaxis(read_channels(path, {0: names})[0], -1, 0), strict=True))
+    whole = open_sequence(path, lights=("all",)).lights
+    assert "ViewLayer.Env" in whole
+    for each in "RGB":
+        seen = pixels[f"ViewLayer.Env.{each}"] == 0
+        pixels[f"ViewLayer.Combined.{each}"] = np.where(seen, pixels[f"ViewLayer.Combined.{each}"], 0)
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", pixels), lights=("all",))
+    assert sorted(sequence.lights) == sorted({*whole} - {"ViewLayer.Env"})
+    assert {"diffuse", "specular"} <= sequence.buffers
+    assert list(sequence.warnings) == []
