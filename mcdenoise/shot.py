@@ -45,7 +45,7 @@ class ShotSettings:
             do not tell, the color is assumed to include it.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
-            patterns, separated by spaces, such as DiffDir DiffInd or Combined_*, or all.
+            patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
         alpha: also denoise the alpha with the same kernels; otherwise it is not changed.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: discard history where the light has changed.

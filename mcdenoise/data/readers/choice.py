@@ -11,7 +11,7 @@ import numpy as np
 
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.cameras import fit_camera
-from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, named, recognise
+from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, named, recognise, usual
 from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
@@ -21,6 +21,8 @@ MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
 # Number of values to compare at a time: 64 MiB.
 _AT_ONCE = 2**24
+# Largest median difference of a depth from that of the positions, relative to it.
+_SAME_DEPTH = 0.01
 # Names that are longer than a single letter.
 _WORDS = re.compile(r"[^\W_]{2}")
 
@@ -35,6 +37,7 @@ class Choice:
         written: the layers that the result replaces: usually that of the color, and layers equal to it.
         unused: layers that look like buffers but are not used.
         unknown: layers with unknown names.
+        warnings: doubtful choices, one line each.
     """
 
     layers: dict[str, Layer] = field(default_factory=dict)
@@ -42,6 +45,7 @@ class Choice:
     written: list[Layer] = field(default_factory=list)
     unused: list[Layer] = field(default_factory=list)
     unknown: list[Layer] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 # Reads some rows of a layer in the first frame.
@@ -83,11 +87,10 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
         candidates["color"], candidates["reference"] = references, []
     color = choice.layers.get("color") or _color(where, candidates["color"], strangers, layers)
     choice.layers["color"] = color
-    for buffer in NAMES:
+    # Positions may tell which depth is right.
+    for buffer in sorted(NAMES, key=lambda name: name == "depth"):
         if buffer not in choice.layers and buffer not in mapping:
-            best = _best(where, buffer, candidates[buffer], color)
-            if best is not None:
-                choice.layers[buffer] = best
+            _choose_best(choice, buffer, candidates[buffer], read)
     own = [layer for layer in strangers if not color.family or layer.family == color.family]
     _by_values(choice, own, mapping, read)
     # Both a denoised and a noisy layer exist: read the noisy one, and write the result to the denoised one.
@@ -166,21 +169,56 @@ def _color(
     return best[0]
 
 
-def _best(where: str, buffer: str, candidates: Sequence[tuple[int, Layer]], color: Layer) -> Layer | None:
-    """The preferred layer of the same image as the color; a layer in a separate file may belong to any image."""
+def _choose_best(choice: Choice, buffer: str, candidates: Sequence[tuple[int, Layer]], read: Read) -> None:
+    """Choose the preferred layer of the same image as the color; one in a separate file may belong to any image.
+
+    Of layers with equally good names, the positions tell the right one, or all of them hold the same; otherwise it is
+    the usual one, with a warning.
+    """
+    color = choice.layers["color"]
     own = [(rank, layer) for rank, layer in candidates if layer.family == color.family or layer.anonymous] or (
         list(candidates) if color.anonymous or not color.family else []
     )
-    if not own:
-        return None
-    least = min(rank for rank, _ in own)
-    best = [layer for rank, layer in own if rank == least]
+    best = [layer for rank, layer in own if rank == min(rank for rank, _ in own)]
+    best.sort(key=usual)
+    if not best:
+        return
     if len(best) > 1:
-        raise InputError(
-            f"{where}: expected one layer for '{buffer}', found {', '.join(map(str, best[:8]))}; "
-            f"choose with --map {buffer}={best[0].name or best[0]}"
-        )
-    return best[0]
+        images = [read(layer, _ALL) for layer in best]
+        ranks = [_rank_by_points(choice, buffer, image, read) for image in images]
+        right = [layer for layer, rank in zip(best, ranks, strict=True) if rank == min(ranks)]
+        alike = all(np.array_equal(image, images[0], equal_nan=True) for image in images)
+        names = ", ".join(layer.place for layer in best[:8])
+        if len(right) == 1:
+            best = right
+            choice.reasons[buffer] = f"of {names} the one that fits a camera at the positions"
+        elif alike:
+            choice.reasons[buffer] = f"the same in {names}"
+        else:
+            choice.reasons[buffer] = f"the usual one of {names}"
+            choice.warnings.append(
+                f"'{buffer}': read from {best[0]}, though {', '.join(map(str, best[1:8]))} may be meant as well; "
+                f"choose with --map {buffer}={best[1].name or best[1]}"
+            )
+    choice.layers[buffer] = best[0]
+
+
+def _rank_by_points(choice: Choice, buffer: str, image: Image, read: Read) -> int:
+    """0 for positions that a camera sees at their pixels and a depth along its axis, 1 for a distance, 2 for others."""
+    if buffer != "position" and (buffer != "depth" or "position" not in choice.layers):
+        return 2
+    position = (image if buffer == "position" else read(choice.layers["position"], _ALL))[..., :3]
+    if position.shape[:2] != image.shape[:2]:
+        return 2
+    hit = np.isfinite(position).all(-1) & (position != 0).any(-1)
+    camera = fit_camera(position, hit)
+    if buffer == "position" or camera is None:
+        return 0 if camera is not None else 2
+    points = np.where(hit[..., None], position, 0)
+    along = points @ camera.matrix[:3, 3] + camera.matrix[3, 3]
+    away = np.linalg.norm(points - camera.eye, axis=-1)
+    off = [float(np.median(np.abs(image[hit, 0] - each[hit]) / np.abs(each[hit]))) for each in (along, away)]
+    return next((rank for rank, each in enumerate(off) if each < _SAME_DEPTH), 2)
 
 
 def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:

@@ -41,6 +41,8 @@ NAMES: dict[str, tuple[str, ...]] = {
 _RANKS = {
     name: (buffer, rank) for buffer, ranks in NAMES.items() for rank, row in enumerate(ranks) for name in row.split()
 }
+# The names of a rank, the first ones first.
+_USUAL = {name: place for place, name in enumerate(_RANKS)}
 # Preference of a layer without a name: the only layer of a file named after the frame.
 _ROOT_RANK = 1
 _ORDER = {
@@ -194,6 +196,11 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     if layer.anonymous and layer.is_color and not (_ABOUT | _OTHERS) & set(words):
         return "color", _ROOT_RANK + 1
     return None
+
+
+def usual(layer: Layer) -> int:
+    """Place of a layer among those of one rank; smaller for names that stand further ahead in :data:`NAMES`."""
+    return _USUAL.get("".join(word.lower() for word in _WORD.findall(layer.title)), len(_USUAL))
 
 
 def is_about_a_buffer(layer: Layer) -> bool:

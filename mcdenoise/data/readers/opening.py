@@ -94,7 +94,7 @@ def open_files(
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
-    shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {})
+    shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {}, warnings=choice.warnings)
     _check(shot)
     found, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
     folder = shot.file(color, numbers[0]).parent

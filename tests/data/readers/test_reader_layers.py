@@ -320,13 +320,9 @@ def test_every_buffer_can_be_asked_for() -> None:
     [
         ("Beauty.R Beauty.G Beauty.B Combined.R Combined.G Combined.B", ["color=Beauty", "color=Combined"]),
         ("A.Combined.R A.Combined.G A.Combined.B B.Combined.R B.Combined.G B.Combined.B", ["color=A.Combined"]),
-        (
-            "R G B albedo.R albedo.G albedo.B diffuse_albedo.R diffuse_albedo.G diffuse_albedo.B",
-            ["albedo=albedo", "albedo=diffuse_albedo", "albedo="],
-        ),
     ],
 )
-def test_two_candidates_are_refused_with_the_option_that_decides(
+def test_two_colors_are_refused_with_the_option_that_decides(
     channels: str, flags: list[str], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
 ) -> None:
     path = save(tmp_path / "a.exr", {name: np.ones(SIZE) for name in channels.split()})
@@ -334,6 +330,53 @@ def test_two_candidates_are_refused_with_the_option_that_decides(
     assert f"--map {flags[0]}" in message
     for flag in flags:
         assert open_sequence(path, mapping=[flag]).size == SIZE
+
+
+@pytest.mark.parametrize("names", [("depth.Z", "Z"), ("Z", "depth.V"), ("Z", "ZDepth"), ("linearZ.R", "zfiltered.R")])
+def test_of_two_depths_that_of_the_positions_is_taken(
+    names: tuple[str, str], rendered: Path, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = rendered / "blender" / "shot_0001.exr"
+    wanted = [*(f"ViewLayer.Combined.{each}" for each in "RGB"), *(f"ViewLayer.Position.{each}" for each in "XYZ")]
+    pixels = read_channels(path, {0: [*wanted, "ViewLayer.Depth.Z"]})[0]
+    color = {each: pixels[..., i] for i, each in enumerate("RGB")}
+    position = {f"Position.{each}": pixels[..., 3 + i] for i, each in enumerate("XYZ")}
+    depth, nonsense = pixels[..., 6], np.random.default_rng(0).uniform(1, 9, pixels.shape[:2])
+    distance = np.linalg.norm(pixels[..., 3:6] - np.array((-0.6, -5.2, 1.7)), axis=-1)
+    for right in (depth, distance):
+        for first, second in ((right, nonsense), (nonsense, right), (right, right)):
+            channels = {**color, **position, names[0]: first, names[1]: second}
+            sequence = open_sequence(save(tmp_path / "a.exr", channels))
+            assert list(sequence.warnings) == []
+            frame = sequence.frame(0)
+            hit = depth < 1e9
+            np.testing.assert_allclose(frame.depth[0, 0].numpy()[hit], right[hit], rtol=1e-6)
+    # That along the axis is usual.
+    for first, second in ((depth, distance), (distance, depth)):
+        sequence = open_sequence(save(tmp_path / "a.exr", {**color, **position, names[0]: first, names[1]: second}))
+        np.testing.assert_allclose(sequence.frame(0).depth[0, 0].numpy()[hit], depth[hit], rtol=1e-6)
+    # Without positions the usual one is taken, with a word on how to take the other.
+    sequence = open_sequence(save(tmp_path / "b.exr", {**color, names[0]: depth, names[1]: nonsense}))
+    (warning,) = sequence.warnings
+    assert "--map depth=" in warning
+    assert "depth" in sequence.buffers
+    assert list(open_sequence(tmp_path / "b.exr", mapping=[f"depth={names[1]}"]).warnings) == []
+
+
+def test_two_layers_of_a_feature_are_no_reason_to_refuse(save: Callable[..., Path], tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    names = "R G B albedo.R albedo.G albedo.B diffuse_albedo.R diffuse_albedo.G diffuse_albedo.B"
+    channels = {name: random.random(SIZE) for name in names.split()}
+    path = save(tmp_path / "a.exr", channels)
+    sequence = open_sequence(path, color_has_albedo=True)
+    (warning,) = sequence.warnings
+    assert "--map albedo=diffuse_albedo" in warning
+    np.testing.assert_allclose(sequence.frame(0).albedo[0, 0], channels["albedo.R"], rtol=1e-6)
+    for flag in ("albedo=albedo", "albedo=diffuse_albedo", "albedo="):
+        assert list(open_sequence(path, mapping=[flag], color_has_albedo=True).warnings) == []
+    # Equal ones are one.
+    channels |= {f"diffuse_albedo.{each}": channels[f"albedo.{each}"] for each in "RGB"}
+    assert list(open_sequence(save(path, channels), color_has_albedo=True).warnings) == []
 
 
 @pytest.mark.parametrize("folder", ["blender_stereo", "blender5_stereo"])
