@@ -50,6 +50,7 @@ from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
+from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._wrapper import name_of
 from mcdenoise.noise import noise_of
 from mcdenoise.sampling import has_exact_features
@@ -169,7 +170,7 @@ class Denoiser:
             discarded, and the exposure. The images do not change. Frames of float64 are computed in float64 if the
             weights are, too.
         alpha: also denoise the alpha of frames, with the kernels of the color; a method without kernels keeps it, and
-            the report says so.
+            the report says so. The color stays a pair with it, also at the rim of what it covers.
         settings: arguments for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
@@ -355,6 +356,10 @@ class Denoiser:
         self._report = report = FrameReport(precision=self._why_precision)
         with listening(report), nullcontext() if self.differentiable else torch.no_grad():
             with timed("validate", self.device):
+                if frame.color.is_meta and self.device.type != "meta":
+                    raise InputError(
+                        "frame: expected tensors with values, found tensors of the device meta, without any"
+                    )
                 given, dtype = frame, self._dtype(frame)
                 hints = Hints(
                     last=self._is_last(),
@@ -363,8 +368,8 @@ class Denoiser:
                     keep_all=self.keep_all,
                     alpha=self.alpha,
                 )
-                frame = self._inspected(frame.to(self.device).to(dtype), report)
-                frame = closed(frame.with_depth().replace(hints=hints))
+                whole = frame.to(self.device).to(dtype).replace(hints=hints)
+                frame, void = self._prepared(whole, report)
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
@@ -381,11 +386,17 @@ class Denoiser:
                 if stages:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
                 output = completed(frame, output._replace(image=output.image.to(dtype)))
+                output = with_void(output, whole, void)
                 result: Output = owned(opened(output), [given, noisy, state])
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
         return result
+
+    def _prepared(self, frame: Frame, report: FrameReport) -> tuple[Frame, Void]:
+        """The frame with valid values, void pixels filled, and layers that sum to its color."""
+        filled, void = without_void(frame)
+        return closed(self._inspected(filled, report).with_depth()), void
 
     def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
         """The frame with valid values. An invalid one raises an error, on a GPU only when the numbers have arrived."""
@@ -469,14 +480,11 @@ def suitable_model(frame: Frame | None, *, still: bool = False, cascade: bool = 
     Args:
         frame: ``None`` for one that is known to have features through a filter.
         still: whether it is the only frame of its shot.
-        cascade: whether a cascade is required, for the settings of its history, or for kernels to filter alpha with.
+        cascade: whether a cascade is required, for the settings of its history.
     """
     exact = frame is not None and has_exact_features(frame)
     if cascade:
-        return (
-            DEFAULT if exact else "cascaded_v3",
-            "of the usual models, only cascades have kernels for alpha and settings of the history",
-        )
+        return DEFAULT if exact else "cascaded_v3", "of the usual models, only cascades have settings of the history"
     name, reason = FILTERED, "features may be noisy, or filtered over pixels"
     if frame is not None and exact:
         if not still and float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
@@ -504,8 +512,9 @@ def denoise(
     many images use a :class:`Denoiser` and :meth:`mcdenoise.Frame.from_numpy`.
 
     Args:
-        color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``: scene-linear radiance of any float
-            dtype. Pixels that are NaN, infinite, negative or above 1e16 are replaced, see :class:`Denoiser`.
+        color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``, or one channel, also ``(H, W)``, which
+            is grey: scene-linear radiance of any float dtype. Pixels that are NaN, infinite, negative or above 1e16 are
+            replaced, see :class:`Denoiser`.
         layout: layout of every array, including the result. It is never guessed: an array of another layout is
             rejected.
         albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
@@ -521,7 +530,8 @@ def denoise(
             settings of the model.
 
     Returns:
-        The denoised image, float32 whatever the dtype of ``color``, in the same layout, contiguous, in its own memory.
+        The denoised image, float32 whatever the dtype of ``color``, in the same layout and with as many channels,
+        contiguous, in its own memory.
 
     Raises:
         InputError: an array has another layout, size or number of channels, holds no floats or illegal values, or the
@@ -545,6 +555,9 @@ def denoise(
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
     # Raises an error for invalid values, which a GPU reports late.
     denoiser._settle()
+    shape = np.shape(color)
+    if len(shape) == 2 or shape[-1 if layout == "HWC" else 0] == 1:
+        return np.ascontiguousarray(image.mean(0).reshape(shape))
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
 
 

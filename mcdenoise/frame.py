@@ -44,6 +44,7 @@ class BufferSpec:
 
 
 _UNBOUNDED = float("inf")
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 BUFFERS: dict[str, BufferSpec] = {
     "color": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance, scene-linear RGB, not clamped"),
@@ -71,6 +72,7 @@ BUFFERS: dict[str, BufferSpec] = {
     "emission": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance sent out by the surface itself, without noise"),
     "variance": BufferSpec(3, 0.0, _UNBOUNDED, "variance of the mean that color is, of each channel"),
     "alpha": BufferSpec(1, 0.0, 1.0, "coverage: 0 where only background is seen"),
+    "mask": BufferSpec(1, 0.0, 1.0, "validity: 0 where a pixel is void, such as a texel outside of all charts"),
     "reference": BufferSpec(3, 0.0, LARGEST_RADIANCE, "converged radiance, scene-linear RGB"),
     "current": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance of this frame alone, where color is accumulated"),
     "length": BufferSpec(1, 0.0, _UNBOUNDED, "history length of an accumulated color, in frames"),
@@ -167,6 +169,8 @@ class Frame:
         emission: ``(B, 3, H, W)`` radiance of the surface itself, without noise.
         variance: ``(B, 3, H, W)`` variance of ``color`` as a mean of samples.
         alpha: ``(B, 1, H, W)`` coverage in [0, 1].
+        mask: ``(B, 1, H, W)`` validity: 0 marks void pixels, which neither give nor take light (a denoiser keeps their
+            values); others are 1.
         samples: ``(B, S, C, H, W)`` single samples; the first three channels are radiance.
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
         current: ``(B, 3, H, W)`` radiance of the current frame, if ``color`` is accumulated: added by the wrapper
@@ -209,6 +213,7 @@ class Frame:
     emission: Tensor | None = None
     variance: Tensor | None = None
     alpha: Tensor | None = None
+    mask: Tensor | None = None
     samples: Tensor | None = None
     reference: Tensor | None = None
     current: Tensor | None = None
@@ -220,12 +225,12 @@ class Frame:
     hints: Hints = _NO_HINTS
 
     def __post_init__(self) -> None:
-        _check_buffer("color", self.color)
+        _ordinary("buffer 'color'", self.color)
         if self.color.ndim != 4 or self.color.shape[1] != 3 or 0 in self.color.shape:
             raise InputError(f"buffer 'color': expected shape (B, 3, H, W), found {tuple(self.color.shape)}")
         batch, _, height, width = self.color.shape
         for name, value in self.items():
-            _check_buffer(name, value)
+            _ordinary(f"buffer '{name}'", value)
             if value.device != self.color.device:
                 raise InputError(
                     f"buffer '{name}': expected on {self.color.device} like 'color', found on {value.device}"
@@ -256,7 +261,8 @@ class Frame:
         otherwise it is a copy.
 
         Args:
-            color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``.
+            color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``; or one channel, ``(H, W)`` too,
+                which is grey. The mask of a masked array becomes the buffer ``mask``.
             layout: layout of every array. It is never guessed: an array of another layout is rejected.
             extra: further buffers by name, each ``(H, W)`` or with any number of channels.
             buffers: buffers of :class:`Frame` by name, such as ``albedo``, in the same layout; a single channel may be
@@ -284,6 +290,11 @@ class Frame:
                 f"buffer '{min(unknown)}': expected one of {', '.join(known)}; others go into extra={{...}}"
                 f"{near and '; '}{near}"
             )
+        color, valid = _unmasked(color, layout)
+        if valid is not None:
+            given_mask = buffers.get("mask")
+            other = valid if given_mask is None else np.asarray(given_mask, np.float32).reshape(valid.shape)
+            buffers["mask"] = np.minimum(valid, other)
         image = _of_array("color", color, layout, None)
         size = (image.shape[2], image.shape[3])
         given: dict[str, Any] = {
@@ -470,8 +481,10 @@ def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int]
     wanted = BUFFERS[name].channels if name in BUFFERS else None
     axis, axes = -1 if layout == "HWC" else -3, 4 if name == "samples" else 3
     found = array.shape
-    if array.ndim == 2 and wanted in (1, None):
+    if array.ndim == 2 and (wanted in (1, None) or name == "color"):
         array = np.expand_dims(array, axis)
+    if name == "color" and array.ndim == axes and array.shape[axis] == 1:
+        array = np.repeat(array, 3, axis)
     fits = array.ndim == axes and 0 not in array.shape and wanted in (None, array.shape[axis])
     image = np.moveaxis(array, axis, -3) if fits else array
     if not fits or image.shape[-2:] != (size or image.shape[-2:]):
@@ -482,6 +495,15 @@ def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int]
         advice = "" if size else _advice(array, axis)
         raise InputError(f"buffer '{name}': expected shape ({listed}){like}, found {found}{advice}")
     return torch.from_numpy(image)[None]
+
+
+def _unmasked(color: ArrayLike, layout: Layout) -> tuple[ArrayLike, NDArray[np.float32] | None]:
+    """A color without numpy's mask, and the mask as a buffer ``(H, W)``: 0 where a channel is masked."""
+    if not isinstance(color, np.ma.MaskedArray):
+        return color, None
+    masked = np.ma.getmaskarray(color)
+    axis = -1 if layout == "HWC" else 0
+    return np.ma.getdata(color), 1 - np.asarray(masked.any(axis) if masked.ndim == 3 else masked).astype(np.float32)
 
 
 def _advice(color: NDArray[Any], axis: int) -> str:
@@ -499,6 +521,10 @@ def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
     """An array of floats whose memory torch can share, or a copy."""
     if isinstance(value, Tensor):
         raise InputError(f"buffer '{name}': expected a numpy array, found a torch.Tensor; Frame itself takes tensors")
+    if np.ma.is_masked(value):
+        raise InputError(
+            f"buffer '{name}': expected a plain array, found a masked one; fill it, and pass mask= for void pixels"
+        )
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -519,9 +545,7 @@ def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
 
 
 def _check_layer(name: str, layer: object, color: Tensor) -> None:
-    if not isinstance(layer, Tensor) or not layer.is_floating_point():
-        found = layer.dtype if isinstance(layer, Tensor) else type(layer).__name__
-        raise InputError(f"layer '{name}': expected a floating-point torch.Tensor, found {found}")
+    layer = _ordinary(f"layer '{name}'", layer)
     if layer.shape != color.shape or layer.device != color.device:
         raise InputError(
             f"layer '{name}': expected shape {tuple(color.shape)} on {color.device} like 'color', found "
@@ -529,11 +553,26 @@ def _check_layer(name: str, layer: object, color: Tensor) -> None:
         )
 
 
-def _check_buffer(name: str, value: object) -> None:
+# What torch itself makes of tensors while it records a graph or differentiates.
+_OF_TORCH = ("torch._subclasses", "torch._functorch", "torch._C", "torch.fx", "torch.nn.parameter")
+
+
+def _ordinary(what: str, value: object) -> Tensor:
+    """A dense tensor of a float dtype with which all of torch computes; anything else is refused in one line."""
     if not isinstance(value, Tensor):
-        raise InputError(f"buffer '{name}': expected a torch.Tensor, found {type(value).__name__}")
-    if not value.is_floating_point():
-        raise InputError(f"buffer '{name}': expected a floating-point dtype, found {value.dtype}")
+        raise InputError(f"{what}: expected a torch.Tensor, found {type(value).__name__}")
+    if type(value) is not Tensor and not type(value).__module__.startswith(_OF_TORCH):
+        found, advice = f"its subclass {type(value).__name__}", "pass as_subclass(torch.Tensor) of it"
+    elif value.is_nested or value.layout != torch.strided:
+        found, advice = "a nested one" if value.is_nested else f"one of {value.layout}", "pass to_dense() of it"
+    elif value.is_neg():
+        found, advice = "a view with the negative bit", "pass resolve_neg() of it"
+    elif value.dtype not in _FLOATS:
+        expected = "a floating-point dtype" + ("" if not value.is_floating_point() else " of 16, 32 or 64 bits")
+        raise InputError(f"{what}: expected {expected}, found {value.dtype}")
+    else:
+        return value
+    raise InputError(f"{what}: expected an ordinary torch.Tensor, found {found}; {advice}")
 
 
 def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:

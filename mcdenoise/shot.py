@@ -31,7 +31,7 @@ class ShotSettings:
         model: a name from `mcdenoise models`, optionally with settings, such as "oidn(quality=fast)"; a weights file;
             or your own model, path/to/file.py:factory or package.module:factory. The default is the model that the
             weights are for; without weights, it depends on the frames: where features have no noise, cascaded_v2 for
-            noisy sequences and oidn_tuned_exact for others, else oidn_tuned; or cascaded_v3 with alpha or
+            noisy sequences and oidn_tuned_exact for others, else oidn_tuned; or cascaded_v3 with
             settings that oidn_tuned does not have.
         weights: safetensors file of your own weights for that model.
         frames: frames to denoise, such as 0-59,70; all by default.
@@ -164,7 +164,7 @@ class ShotSettings:
             if self.model is not None or self.weights is not None:
                 return self, ""
             historic = self.alpha_min is not None or not self.anti_lag or self.tolerance is not None
-            model, why = default_model(sequence, cascade=self.alpha or historic)
+            model, why = default_model(sequence, cascade=historic)
             return replace(self, model=model), f"{model}: {why}"
         # Imported here because it loads the benchmark, which takes time.
         from mcdenoise.budget import choose_model

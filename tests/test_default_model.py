@@ -57,7 +57,7 @@ def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> No
         (ShotSettings(), "oidn_tuned"),
         # Any model's image is split into layers.
         (ShotSettings(layers=("all",)), "oidn_tuned"),
-        (ShotSettings(alpha=True), "cascaded_v3"),
+        (ShotSettings(alpha=True), "oidn_tuned"),
         (ShotSettings(alpha_min=0.5), "cascaded_v3"),
         (ShotSettings(tolerance=0.0), "cascaded_v3"),
         (ShotSettings(anti_lag=False), "cascaded_v3"),

@@ -37,9 +37,9 @@ def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None
     arrays = {name: image(BUFFERS[name].channels, layout, seed=seed) for seed, name in enumerate(names)}
     matrix = np.arange(16.0).reshape(4, 4)
     samples = np.stack([image(5, layout, seed=seed) for seed in (50, 51)])
-    extra = {"crypto": image(2, layout, seed=60), "mask": image(1, seed=61)[..., 0]}
+    extra = {"crypto": image(2, layout, seed=60), "matte": image(1, seed=61)[..., 0]}
     frame = Frame.from_numpy(**arrays, layout=layout, view_projection=matrix, samples=samples, extra=extra)
-    assert frame.buffers == {*names, "view_projection", "samples", "crypto", "mask"}
+    assert frame.buffers == {*names, "view_projection", "samples", "crypto", "matte"}
     for seed, name in enumerate(names):
         tensor = frame.buffer(name)
         assert tensor is not None
@@ -51,7 +51,7 @@ def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None
     assert frame.samples is not None
     assert torch.equal(frame.samples[0, 1].permute(1, 2, 0), torch.from_numpy(image(5, seed=51)))
     assert torch.equal(frame.extra["crypto"][0].permute(1, 2, 0), torch.from_numpy(image(2, seed=60)))
-    assert frame.extra["mask"].shape == (1, 1, HEIGHT, WIDTH)
+    assert frame.extra["matte"].shape == (1, 1, HEIGHT, WIDTH)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -137,7 +137,7 @@ def test_memory_is_shared_where_that_is_possible() -> None:
         (image(3, "HWC"), "CHW", "expected shape (3, H, W), found (5, 7, 3); pass layout='HWC'"),
         (image(4), "HWC", "expected shape (H, W, 3), found (5, 7, 4); pass its first three channels"),
         (image(4, "CHW"), "CHW", "expected shape (3, H, W), found (4, 5, 7); pass its first three channels"),
-        (image(1)[..., 0], "HWC", "expected shape (H, W, 3), found (5, 7)"),
+        (image(2), "HWC", "expected shape (H, W, 3), found (5, 7, 2)"),
         (image(3)[None], "HWC", "expected shape (H, W, 3), found (1, 5, 7, 3); pass one image, or tensors"),
         (image(3)[:0], "HWC", "expected shape (H, W, 3), found (0, 7, 3)"),
         (np.uint8(image(3)), "HWC", "found uint8; undo the encoding of a display first, about (x / 255)"),

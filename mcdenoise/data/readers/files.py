@@ -254,6 +254,11 @@ class RenderedFiles:
         if color.shape[2] > 3:
             images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
         images["color"] = _without_lossy_black(color[..., :3])
+        if "mask" in images and (images["mask"] > 0).any():
+            # A matte of an object is called a mask, too: beside it there is light.
+            images["mask"] = np.where((images["color"] > 0).any(-1, keepdims=True), 1, images["mask"] > 0).astype(
+                np.float32
+            )
         seen = seen_of(images)
         if "albedo" in images:
             images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)

@@ -35,6 +35,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "motion": ("vector motion motionvector motionvectors mvec mv flow backward", "velocity"),
     "variance": ("variance rgbavariance rgbvariance colorvariance beautyvariance",),
     "alpha": ("alpha a",),
+    "mask": ("mask validity coverage",),
     "roughness": ("roughness",),
     "reference": ("reference ref groundtruth gt converged",),
 }

@@ -1,0 +1,176 @@
+"""Void pixels, which hold no light: filled before a method sees a frame, and as they were after it; and straight light.
+
+Around the charts of a lightmap, and behind everything of a transparent film, pixels are black because nothing is there.
+A filter would take that for darkness, and a network for an edge. So void pixels show the mirror image of what is beside
+them, in every buffer, and get their own values back at the end.
+
+A color is multiplied by its alpha, so the two are one pair: where one is blurred and the other is not, their ratio, the
+color of the surface at a rim, is wrong. So where alpha is wanted too, a method sees light divided by alpha.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from mcdenoise.frame import RADIANCE, Frame, scale_samples
+from mcdenoise.models._interface import Output
+from mcdenoise.models._journal import note
+from mcdenoise.models._reads import at_hand
+
+# Where more than this fraction of the light is in pixels of alpha 0 (a glow), alpha does not say where light can be.
+_GLOW = 1e-3
+# Smallest alpha to divide by.
+_LEAST = 1e-3
+# Side of the window of pixels that are partly covered in which alpha is no edge.
+_RAMP = 5
+# Buffers that are not filled: they are no picture, or are not denoised.
+_KEPT = frozenset({"alpha", "mask", "reference", "length", "view_projection"})
+
+
+class Void(NamedTuple):
+    """What :func:`with_void` needs to give void pixels their values back.
+
+    Args:
+        mask: ``(B, 1, H, W)`` bool: void pixels; ``None`` if there is none.
+        alpha: ``(B, 1, H, W)`` by which the light was divided; ``None`` if it was not.
+    """
+
+    mask: Tensor | None = None
+    alpha: Tensor | None = None
+
+
+def without_void(frame: Frame) -> tuple[Frame, Void]:
+    """Fill the void pixels of a frame, and divide its light by alpha if that is to be denoised.
+
+    Pixels are void where ``mask`` is 0; where alpha and color are 0; or, in a frame without mask, alpha, motion and
+    camera, where the depth is infinite and the color 0. Alpha and depth only count if no more than a thousandth of the
+    light is where they say that nothing is.
+
+    Args:
+        frame: as a renderer wrote it, its values unchecked.
+
+    Returns:
+        The frame without a mask, and what :func:`with_void` needs.
+    """
+    color, alpha, depth, known = frame.color, frame.alpha, frame.depth, at_hand(frame.color.device)
+    void = None if frame.mask is None else frame.mask <= 0
+    chart = frame.motion is None and frame.view_projection is None and alpha is None and void is None
+    # Not on a GPU, where nearly every frame would be filled without need.
+    nothing = alpha <= 0 if alpha is not None else depth == torch.inf if chart and known and depth is not None else None
+    frame, divisor = frame.replace(mask=None), None
+    if nothing is not None:
+        covers = _covers(color, nothing)
+        empty = nothing & (color == 0).all(1, keepdim=True) & covers
+        void = empty if void is None else void | empty
+        if alpha is not None and frame.hints.alpha:
+            divisor = torch.where(covers, alpha.clamp(_LEAST, 1), 1)
+            frame = _divided(frame, divisor)
+    if void is None or (known and not void.any()):
+        return frame, Void(None, divisor)
+    note("void", "filled from around, and kept")
+    source = _mirrored(void)
+
+    def fill(image: Tensor) -> Tensor:
+        flat = image.flatten(1, -3).flatten(2)
+        return flat.gather(2, source.expand(-1, flat.shape[1], -1)).reshape(image.shape)
+
+    changes: dict[str, Any] = {name: fill(image) for name, image in frame.items() if name not in _KEPT}
+    extra = {name: changes.pop(name) for name in frame.extra}
+    layers = {name: fill(layer) for name, layer in frame.layers.items()}
+    return frame.replace(**changes, extra=extra, layers=layers), Void(void, divisor)
+
+
+def with_void(output: Output, frame: Frame, void: Void) -> Output:
+    """The output with the light in the unit of the given frame, and with its void pixels as they were.
+
+    An alpha that was filtered is used inside of wide ramps; at an edge it is the frame's own: the light that guided the
+    filter is that of the surface, and does not tell where the surface ends.
+
+    Args:
+        output: of the frame without void.
+        frame: as it was given.
+        void: result of :func:`without_void`.
+    """
+    alpha, divisor = frame.alpha, void.alpha
+    if alpha is not None and output.alpha is not None:
+        filtered = output.alpha
+        partly = ((alpha <= 0) | (alpha >= 1)).to(alpha.dtype)
+        after = torch.where(F.max_pool2d(partly, _RAMP, 1, _RAMP // 2) > 0, alpha, filtered)
+        output = output._replace(alpha=after)
+        if divisor is not None:
+            # Where the light was not divided, it stays as it is.
+            multiplier = torch.where(divisor == alpha.clamp(_LEAST, 1), after.clamp(_LEAST, 1), divisor)
+            output = _light(output, lambda image: image * multiplier)
+    if (mask := void.mask) is None:
+        return output
+    given = torch.where(torch.isfinite(frame.color), frame.color, 0).clamp_min(0)
+    layers = {
+        name: torch.where(mask, frame.layers[name].to(layer.dtype) if name in frame.layers else 0, layer)
+        for name, layer in output.layers.items()
+    }
+    return output._replace(image=torch.where(mask, given.to(output.image.dtype), output.image), layers=layers)
+
+
+def _covers(color: Tensor, nothing: Tensor) -> Tensor:
+    """``(B, 1, 1, 1)``: whether (almost) no light is where nothing is."""
+    light = torch.where(torch.isfinite(color), color, 0).abs().sum(1, keepdim=True)
+    outside, everywhere = (each.sum((2, 3), keepdim=True) for each in (torch.where(nothing, light, 0), light))
+    return outside <= _GLOW * everywhere
+
+
+def _divided(frame: Frame, alpha: Tensor) -> Frame:
+    """The frame with straight light: not multiplied by its alpha."""
+    changes: dict[str, Any] = {name: image / alpha for name, image in frame.items() if name in RADIANCE}
+    changes["layers"] = {name: layer / alpha for name, layer in frame.layers.items()}
+    for name in ("albedo", "specular_albedo"):
+        if (albedo := frame.buffer(name)) is not None:
+            # A renderer's albedo is a mean over the pixel too.
+            changes[name] = torch.where(alpha < 1, (albedo / alpha).clamp_max(1), albedo)
+    if frame.variance is not None:
+        changes["variance"] = frame.variance / alpha.square()
+    if frame.samples is not None:
+        changes["samples"] = scale_samples(frame.samples, (1 / alpha).expand(-1, 3, -1, -1))
+    return frame.replace(**changes)
+
+
+def _mirrored(void: Tensor) -> Tensor:
+    """``(B, 1, H W)``: for each pixel the one whose values it takes.
+
+    That of a void pixel is its mirror image at the nearest pixel that is not, in its row or column. A second round is
+    for pixels whose row and column are void.
+    """
+    batch, _, height, width = void.shape
+    source = torch.arange(height * width, device=void.device).expand(batch, -1)
+    known = ~void[:, 0]
+    for _ in range(2):
+        nearest = torch.full_like(known, height + width, dtype=torch.int64)
+        found = source.reshape(batch, height, width)
+        whole = found
+        for axis in (1, 2):
+            size = known.shape[axis]
+            place = torch.arange(size, device=void.device).reshape([-1, 1] if axis == 1 else [1, -1])
+            for sign in (1, -1):
+                # The last known place before each, or the next one after it, and the same distance beyond.
+                far = torch.where(known, sign * place, -2 * size)
+                last = far.cummax(axis).values if sign == 1 else far.flip(axis).cummax(axis).values.flip(axis)
+                last = sign * last
+                distance = (place - last).abs()
+                beyond = (2 * last + sign - place).clamp(0, size - 1)
+                there = known.gather(axis, beyond)
+                moved = whole.gather(axis, torch.where(there, beyond, last.clamp(0, size - 1)))
+                closer = (distance < nearest) & (last >= 0) & (last < size)
+                nearest, found = torch.where(closer, distance, nearest), torch.where(closer, moved, found)
+        source = torch.where(known, whole, found).flatten(1)
+        known = known | (nearest < height + width)
+    return source[:, None]
+
+
+def _light(output: Output, function: Callable[[Tensor], Tensor]) -> Output:
+    layers = {name: function(layer) for name, layer in output.layers.items()}
+    stages = {name: function(image) for name, image in output.stages.items() if image.shape == output.image.shape}
+    return output._replace(image=function(output.image), layers=layers, stages={**output.stages, **stages})

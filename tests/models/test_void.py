@@ -1,0 +1,187 @@
+"""Void pixels neither give nor take light, and color and alpha are one pair."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from toys import Same, refused
+
+import mcdenoise
+from mcdenoise import Denoiser, Frame
+from mcdenoise.frame import Hints
+from mcdenoise.models._void import with_void, without_void
+
+
+def charts(void: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Two charts of noise, bright and dark, and where they are."""
+    noise = 1 + 0.2 * torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0))
+    valid, color = torch.zeros(1, 1, 24, 40), torch.full((1, 3, 24, 40), void)
+    for columns, value in ((slice(3, 17), 1.0), (slice(23, 37), 0.05)):
+        valid[..., 3:21, columns] = 1
+        color[..., 3:21, columns] = value * noise[..., 3:21, columns]
+    return color, valid
+
+
+def blur(color: Tensor) -> Tensor:
+    return torch.nn.functional.avg_pool2d(color, 5, 1, 2, count_include_pad=False)
+
+
+@pytest.mark.parametrize("how", ["mask", "alpha", "depth"])
+def test_charts_keep_their_light_up_to_their_borders(how: str) -> None:
+    color, valid = charts()
+    buffers = {how: torch.where(valid > 0, 1, torch.inf) if how == "depth" else valid}
+    image = Denoiser(blur)(Frame(color, **buffers))
+    assert torch.equal(image * (1 - valid), torch.zeros_like(image))
+    for columns, value in ((slice(3, 17), 1.0), (slice(23, 37), 0.05)):
+        chart = image[..., 3:21, columns] / value
+        assert 1 <= chart.min() <= chart.max() <= 1.2
+
+
+def test_what_is_masked_does_not_count_and_stays() -> None:
+    clean, valid = charts()
+    image = Denoiser(blur)(Frame(clean, mask=valid))
+    color, _ = charts(void=9.0)
+    color[..., 0, :] = torch.nan
+    depth = torch.where(valid > 0, 2, torch.nan)
+    other = Denoiser(blur)(Frame(color, mask=valid, depth=depth))
+    assert torch.equal(other * valid, image * valid)
+    assert (other[..., 1:3, :] == 9).all()
+    assert not other[..., 0, :].any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (30, 50)])
+def test_every_void_pixel_is_filled_from_one_that_is_not(size: tuple[int, int]) -> None:
+    color = torch.zeros(2, 3, *size)
+    color[..., size[0] // 2, size[1] // 3] = 2
+    mask = (color[:, :1] > 0).float()
+    frame, _ = without_void(Frame(color, mask=mask, layers={"part": color / 2}, extra={"own": color[:, :2]}))
+    assert frame.mask is None
+    assert (frame.color == 2).all()
+    assert (frame.layers["part"] == 1).all()
+    assert (frame.extra["own"] == 2).all()
+    # If all is void, nothing is to be taken.
+    assert torch.equal(without_void(Frame(color, mask=0 * mask))[0].color, color)
+
+
+def test_the_fill_is_the_mirror_image() -> None:
+    row = torch.tensor([0.0, 0, 0, 4, 5, 6, 7, 0, 0, 0, 0, 9]).expand(1, 3, 1, -1)
+    frame, _ = without_void(Frame(row, mask=(row[:, :1] > 0).float()))
+    assert frame.color[0, 0, 0].tolist() == [6, 5, 4, 4, 5, 6, 7, 7, 6, 9, 9, 9]
+
+
+def test_light_where_nothing_is_means_that_nothing_is_void() -> None:
+    """A glow has light where alpha is 0, and fog where the depth is infinite; its noise has black pixels."""
+    color, valid = charts()
+    color[..., 8, 18:22] = 0.5
+    for frame in (Frame(color, alpha=valid), Frame(color, depth=torch.where(valid > 0, 1, torch.inf))):
+        assert without_void(frame)[1].mask is None
+        assert torch.equal(Denoiser(blur)(frame), blur(color))
+        frame = frame.replace(hints=Hints(alpha=True))
+        assert torch.equal(without_void(frame)[0].color, color)
+
+
+@pytest.mark.parametrize("model", ["joint_bilateral", "guided", blur])
+def test_color_and_alpha_are_one_pair(model: object) -> None:
+    rows, columns = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    cover = (18.5 - ((rows - 24) ** 2 + (columns - 30) ** 2).sqrt()).div(2).clamp(0, 1)[None, None]
+    red = torch.tensor([0.8, 0.1, 0.05]).reshape(1, 3, 1, 1)
+    frame = Frame(cover * red, alpha=cover, layers={"half": cover * red / 2})
+    output = Denoiser(model, alpha=True).output(frame)
+    assert output.alpha is not None
+    torch.testing.assert_close(output.image, output.alpha * red, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(output.alpha, cover)
+    torch.testing.assert_close(output.layers["half"], output.image / 2, rtol=1e-3, atol=1e-5)
+
+
+def test_a_wide_ramp_of_alpha_is_filtered() -> None:
+    alpha = 0.5 + 0.3 * torch.rand(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
+    output = Denoiser("joint_bilateral", alpha=True).output(Frame(alpha * torch.ones(1, 3, 1, 1), alpha=alpha))
+    assert output.alpha.std() < 0.5 * alpha.std()
+    torch.testing.assert_close(output.image, output.alpha.expand(-1, 3, -1, -1), rtol=1e-4, atol=1e-5)
+
+
+def test_the_mask_of_an_array_is_the_buffer() -> None:
+    color, valid = (each[0].numpy().transpose(1, 2, 0) for each in charts(void=float("nan")))
+    masked = np.ma.masked_invalid(color)
+    image = mcdenoise.denoise(masked, model=blur)
+    np.testing.assert_array_equal(image, mcdenoise.denoise(np.nan_to_num(color), mask=valid, model=blur))
+    assert np.ma.masked_invalid(color[..., 0]).mask.any()
+    np.testing.assert_allclose(mcdenoise.denoise(np.ma.masked_invalid(color[..., 0]), model=blur), image[..., 0])
+    assert "masked" in refused(lambda: Frame.from_numpy(color, depth=np.ma.masked_invalid(color[..., 0])))
+    assert Frame.from_numpy(np.ma.masked_array(np.ones((4, 5, 3)))).mask.all()
+
+
+@pytest.mark.parametrize("layout", ["HWC", "CHW"])
+def test_one_channel_is_grey(layout: mcdenoise.frame.Layout) -> None:
+    grey = np.random.default_rng(0).random((24, 32))
+
+    def denoised(color: object) -> np.ndarray:
+        return mcdenoise.denoise(color, model="joint_bilateral", layout=layout)
+
+    image = denoised(grey)
+    color = np.repeat(grey[..., None], 3, -1)
+    expected = mcdenoise.denoise(
+        color if layout == "HWC" else color.transpose(2, 0, 1), model="joint_bilateral", layout=layout
+    )
+    assert image.shape == (24, 32)
+    np.testing.assert_allclose(image, expected.mean(-1 if layout == "HWC" else 0), rtol=1e-6)
+    single = grey[..., None] if layout == "HWC" else grey[None]
+    np.testing.assert_array_equal(denoised(single), image.reshape(single.shape))
+
+
+def test_a_method_sees_no_mask() -> None:
+    class Seen(Same):
+        def forward(self, frame: Frame, state: object = None) -> object:
+            assert frame.mask is None
+            return super().forward(frame, state)
+
+    color, valid = charts()
+    assert torch.equal(Denoiser(Seen())(Frame(color, mask=valid)), color)
+
+
+class Own(Tensor):
+    """A class of a user's own."""
+
+
+def jagged() -> Tensor:
+    return torch.nested.nested_tensor([torch.ones(3, 4, 5), torch.ones(3, 4, 6)])
+
+
+@pytest.mark.parametrize(
+    "color",
+    [
+        torch.ones(1, 3, 4, 5).to_sparse(),
+        torch.ones(1, 3, 4, 5).to_mkldnn(),
+        torch.ones(1, 3, 4, 5).to(torch.float8_e4m3fn),
+        torch.ones(1, 3, 4, 5, dtype=torch.complex64),
+        torch.ones(1, 3, 4, 5, dtype=torch.complex64).conj().imag,
+        torch.ones(1, 3, 4, 5).as_subclass(Own),
+        jagged,
+    ],
+    ids=["sparse", "mkldnn", "float8", "complex", "negative", "subclass", "nested"],
+)
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
+def test_unusual_tensors_are_refused_in_one_line(color: object) -> None:
+    value = color() if callable(color) else color
+    for make in (lambda: Frame(value), lambda: Frame(torch.ones(1, 3, 4, 5), albedo=value)):
+        message = refused(make)
+        assert message.startswith(("buffer 'color': expected", "buffer 'albedo': expected"))
+        assert "\n" not in message
+    assert "layer 'part'" in refused(lambda: Frame(torch.ones(1, 3, 4, 5), layers={"part": value}))
+
+
+def test_tensors_without_values_are_refused() -> None:
+    assert "meta" in refused(lambda: Denoiser(Same())(Frame(torch.ones(1, 3, 4, 5, device="meta"))))
+    # What torch makes itself is an ordinary tensor.
+    assert Frame(torch.nn.Parameter(torch.ones(1, 3, 4, 5))).size == (4, 5)
+
+
+def test_the_output_keeps_the_layers_of_void_pixels() -> None:
+    color, valid = charts()
+    frame = Frame(color, mask=valid, layers={"all": color})
+    filled, void = without_void(frame)
+    output = with_void(mcdenoise.models.Output(filled.color, layers=dict(filled.layers)), frame, void)
+    assert torch.equal(output.image, color)
+    assert torch.equal(output.layers["all"], color)
