@@ -100,16 +100,16 @@ def main() -> None:
         peer = [str(folder / "frame"), str(folder / "oidn.exr"), options.quality, threads]
         own = ["denoise", str(folder / "frame"), "-o", str(folder / "out"), "--model", options.model]
         commands = {
-            f"pyoidn, {options.quality}": [sys.executable, "-c", PEER, *peer, "as it is"],
-            f"pyoidn, {options.quality}, without torch": [sys.executable, "-c", PEER, *peer, "without torch"],
+            f"pyoidn, {options.quality}": [sys.executable, "-P", "-c", PEER, *peer, "as it is"],
+            f"pyoidn, {options.quality}, without torch": [sys.executable, "-P", "-c", PEER, *peer, "without torch"],
             **{
                 f"mcdenoise denoise, {options.model}, {precision}": [
-                    *(sys.executable, "-m", "mcdenoise", *own),
+                    *(sys.executable, "-P", "-m", "mcdenoise", *own),
                     *("--precision", precision, "--threads", threads),
                 ]
                 for precision in options.precisions.split(",")
             },
-            "import torch": [sys.executable, "-c", "import torch"],
+            "import torch": [sys.executable, "-P", "-c", "import torch"],
         }
         times: dict[str, list[float]] = {name: [] for name in commands}
         for _ in range(options.rounds + 1):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+# `python -m mcdenoise` runs this file while modules of the working folder still come first, so it imports no `typing`.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from mcdenoise import ops
     from mcdenoise.denoiser import Denoiser, denoise
     from mcdenoise.errors import InputError

@@ -15,6 +15,8 @@ from pathlib import Path
 from types import FrameType
 
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
+# The environment variable for the option -P of Python.
+_SAFE_PATH = "PYTHONSAFEPATH"
 _NO_WARNING = "ignore:resource_tracker:UserWarning"
 # Time in seconds for an orderly shutdown.
 _GRACE = 1.25
@@ -39,9 +41,24 @@ def start_resource_tracker() -> None:
     # It is started with the options of this interpreter.
     sys.warnoptions.append(_NO_WARNING)
     try:
-        resource_tracker.ensure_running()
+        with safe_path():
+            resource_tracker.ensure_running()
     finally:
         sys.warnoptions.remove(_NO_WARNING)
+
+
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Start Python processes inside this block that import nothing from the working folder, which may be anyone's."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 @contextmanager
@@ -66,7 +83,7 @@ def remove_unfinished() -> None:
 
 @contextmanager
 def deaf_children() -> Iterator[None]:
-    """Start child processes inside this block that ignore Ctrl+C from the beginning.
+    """Start child processes inside this block that ignore Ctrl+C from the beginning, with a :func:`safe_path`.
 
     A terminal sends Ctrl+C to all processes of a command. The main process tells its children what to do; tracebacks
     from children that are still importing modules would not help. A signal that this process receives inside the block
@@ -76,7 +93,8 @@ def deaf_children() -> Iterator[None]:
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
     _starts.active, _starts.interrupted = True, False
     try:
-        yield
+        with safe_path():
+            yield
     finally:
         _starts.active = False
         if masks:

@@ -47,7 +47,7 @@ def output_and_peak(*arguments: object) -> tuple[str, float]:
     Raises:
         InputError: the command fails; the message ends with the last line that it printed.
     """
-    command = [sys.executable, "-c", _LAUNCHER, sys.executable, "-m", "mcdenoise", *map(str, arguments)]
+    command = [sys.executable, "-P", "-c", _LAUNCHER, sys.executable, "-P", "-m", "mcdenoise", *map(str, arguments)]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode:
         last = done.stdout.strip().rpartition("\n")[2]

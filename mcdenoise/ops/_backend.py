@@ -151,6 +151,6 @@ def _missing(backend: Backend) -> str:
 def _tried_import(backend: Backend) -> str:
     try:
         importlib.import_module(backend)
-    except ImportError as error:
-        return f"cannot be imported ({error}); install mcdenoise[{_EXTRAS[backend]}]"
+    except Exception as error:  # so does a damaged file of settings, or too little memory for LLVM
+        return f"cannot be imported ({' '.join(str(error).split())}); install mcdenoise[{_EXTRAS[backend]}]"
     return ""

@@ -71,7 +71,10 @@ _STYLE: Any = {
 @contextmanager
 def plot_style() -> Iterator[None]:
     """The look of every plot: make and save figures inside."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context():
+        # The settings of a file matplotlibrc in the working folder are not for these plots.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
         yield
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -170,3 +173,60 @@ def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(
     status, said = run(f"denoise {small_sequence} -o out --model {name}")
     assert (status, said.count("\n")) == (2, 1), said
     assert not (here / "out").exists()
+
+
+SHADOWED = (
+    "numpy",
+    "torch",
+    "mitsuba",
+    "drjit",
+    "typing",
+    "socket",
+    "pickle",
+    "json",
+    "random",
+    "multiprocessing",
+    "bpy",
+)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "-m mcdenoise inspect {shot}",
+        "-m mcdenoise film film.toml -o out --workers 2",
+        "-m mcdenoise generate -o made --seeds 0 --frames 2 --size 32x32 --spp 1 --reference-spp 2 --workers 2",
+    ],
+    ids=["command", "workers", "spawned"],
+)
+def test_modules_of_the_working_folder_are_not_imported(line: str, here: Path, small_sequence: Path) -> None:
+    if "generate" in line:
+        pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    for name in SHADOWED:
+        (here / f"{name}.py").write_text(f"open({str(here / 'touched')!r}, 'a').write({name!r})\nraise SystemExit(3)\n")
+    (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "{small_sequence}"\nmodel = "noisy"\n')
+    (here / ".numba_config.yaml").write_text(f"cache_dir: {here}/hostile\n")
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    command = [sys.executable, *line.format(shot=small_sequence).split()]
+    done = subprocess.run(command, cwd=here, env=environment, capture_output=True, text=True, check=False)
+    assert not (here / "touched").exists(), (here / "touched").read_text()
+    assert done.returncode == 0, done.stderr
+    assert not (here / "hostile").exists()
+
+
+def test_native_code_beside_a_scene_is_not_loaded(here: Path, run: Callable[[str], tuple[int, str]]) -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    from mcdenoise.scenes.render.tracer import Tracer
+
+    (here / "plugins").mkdir()
+    for suffix in (".so", ".dylib", ".dll"):
+        (here / f"plugins/diffuse{suffix}").write_text("no library")
+    scene = '<scene version="3.0.0">{}<shape type="rectangle"><bsdf type="diffuse"/></shape></scene>'
+    (here / "elsewhere").mkdir()
+    (here / "elsewhere/scene.xml").write_text(scene.format(""))
+    Tracer(here / "elsewhere/scene.xml", "scalar_rgb", 2)
+    (here / "scene.xml").write_text(scene.format(""))
+    (here / "elsewhere/other.xml").write_text(scene.format(f'<path value="{here}"/>'))
+    for place in ("scene.xml", "elsewhere/other.xml"):
+        with pytest.raises(InputError, match="plug-ins"):
+            Tracer(here / place, "scalar_rgb", 2)

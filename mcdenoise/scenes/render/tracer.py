@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -324,8 +325,10 @@ for variant in {variants!r}:
     print("works:", variant)
     break
 """
+    # Neither Python, with -P, nor Mitsuba then loads anything from the folder of somebody's scene.
+    command, folder = [sys.executable, "-P", "-c", trial], Path(__file__).parent
     try:
-        child = subprocess.run([sys.executable, "-c", trial], capture_output=True, text=True, timeout=120, check=False)
+        child = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=folder)
     except (OSError, subprocess.TimeoutExpired):
         return None
     # The output may also contain other text, such as warnings of a driver.
@@ -368,11 +371,17 @@ def scene_digest(scene: Scene) -> str:
 
 def _import_mitsuba() -> Any:
     try:
-        return importlib.import_module("mitsuba")
+        mitsuba = importlib.import_module("mitsuba")
     except ImportError as error:
         raise InputError(
             "rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'"
         ) from error
+    places = mitsuba.file_resolver()
+    for number in reversed(range(len(places))):
+        # Mitsuba would load native code, plugins/NAME.so, from the working folder before its own.
+        if str(places[number]) == os.getcwd():
+            del places[number]
+    return mitsuba
 
 
 def _load_scene(mi: Any, scene: Scene, merge: bool) -> Any:
@@ -380,6 +389,14 @@ def _load_scene(mi: Any, scene: Scene, merge: bool) -> Any:
         scene = Path(scene)
         if not scene.is_file():
             raise InputError(f"{scene}: expected a Mitsuba scene, found no such file; check the path")
+        scene = scene.absolute()
+        native = [each.name for each in scene.parent.glob("plugins/*") if each.suffix in (".so", ".dylib", ".dll")]
+        if native or b"<path" in scene.read_bytes():
+            found = f"plugins/{native[0]}" if native else "an element <path>, which names a folder for them"
+            raise InputError(
+                f"{scene}: expected a scene without plug-ins, which are native code that Mitsuba would run, found "
+                f"{found}; remove it"
+            )
     try:
         if isinstance(scene, Mapping):
             loaded = mi.load_dict(_to_mitsuba(mi, scene), optimize=merge)
