@@ -21,6 +21,7 @@ from typing import Any
 
 from mcdenoise.denoiser import FrameReport
 from mcdenoise.errors import InputError
+from mcdenoise.light import Repairs
 from mcdenoise.models import Stage
 
 # Path, size, time of the last change in nanoseconds; a time of -1 is that of no file.
@@ -68,6 +69,8 @@ class FrameRecord:
                 return None
             report = found["report"]
             report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
+            *counts, place = report["repairs"]
+            report["repairs"] = Repairs(*counts, place=tuple(place))
             inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])
             own = {**found, "result": _stamp(found["result"]), "inputs": inputs, "report": FrameReport(**report)}
             return cls(**own)

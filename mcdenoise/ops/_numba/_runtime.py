@@ -23,7 +23,7 @@ from torch import Tensor
 from mcdenoise.ops._numba._cache import VerifiedCache
 
 # Numba takes settings from a file in the working folder, too, which has no say in the folder of compiled code.
-numba.config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR", "")
+numba.config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR", "")  # type: ignore[attr-defined]
 # Handing rows to a thread takes as long as filtering some thousand pixels, or this many times as many pixels if there
 # are a few operations for each.
 PIXELS_A_THREAD, LIGHT = 16384, 4
