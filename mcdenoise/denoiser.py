@@ -46,11 +46,12 @@ from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._journal import ask
 from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
-from mcdenoise.models._memory import Division, Frames
+from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.models._void import Void, with_void, without_void
+from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapper import name_of
 from mcdenoise.noise import noise_of
 from mcdenoise.sampling import has_exact_features
@@ -106,6 +107,7 @@ class FrameReport(Journal):
     """
 
     precision: str = ""
+    model: str = ""
     repairs: Repairs = field(default_factory=Repairs)
     missing: list[str] = field(default_factory=list)
     beside: dict[str, float] = field(default_factory=dict)
@@ -133,6 +135,7 @@ class FrameReport(Journal):
             "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
             "tiles": self.tiles,
             "precision": self.precision,
+            "model": self.model,
         }
         return "\n".join(f"{name}: {text}" for name, text in lines.items() if text)
 
@@ -147,7 +150,9 @@ class Denoiser:
         model: the name of a model in the zoo (its shipped weights are loaded), your own ``path/to/file.py:factory`` or
             ``package.module:factory``, a :class:`mcdenoise.models.Model`, or a module or function whose parameters are
             named like buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved to the device,
-            made channels-last and put into evaluation mode.
+            made channels-last and put into evaluation mode. By default it is the one that the weights are for; without
+            weights, the first frame chooses it, once, as in `mcdenoise denoise` (:func:`suitable_model`), and the
+            report says which and why. Until then the attribute ``model`` is ``None``; see :meth:`pick`.
         weights: a safetensors file of other weights for a model given by name.
         device: device to run on. Frames may come from any device; images are returned on this one.
         precision: precision of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
@@ -188,7 +193,7 @@ class Denoiser:
 
     def __init__(
         self,
-        model: str | Model | nn.Module = DEFAULT,
+        model: str | Model | nn.Module | None = None,
         *,
         weights: Path | str | None = None,
         device: torch.device | str = "cpu",
@@ -210,40 +215,80 @@ class Denoiser:
         if precision not in known:
             raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
         self.keep_all, self.differentiable, self.alpha = keep_all, differentiable, alpha
-        name, of_zoo = str(model), isinstance(model, str) and ":" not in model
-        if isinstance(model, str):
-            _check_settings(model, settings)
-            model = create_model(model, pretrained=weights is None, weights=weights, **settings)
-        elif settings or weights is not None:
-            raise InputError(
-                f"{', '.join([*settings, *(['weights'] if weights else [])])}: expected a model's name, found a model"
-            )
-        if isinstance(model, nn.Module):
-            # Channels-last convolutions are about 1.5 times faster on a CPU.
-            model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
-        self.model = as_model(model)
-        self._name = name if of_zoo else name_of(self.model)
-        self.precision, self._why_precision = self._chosen(precision, of_zoo=of_zoo)
-        if self.precision == "int8":
-            if differentiable:
-                raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
-            quantize(self.model, self.device)
+        self._picked = ""
+        self._asked, self._given, self._limits = precision, settings, (tile, max_memory)
+        if model is None and weights is not None:
+            model = model_of(Path(weights))
+        elif model is None and precision == "int8":
+            # The only calibrated one of those that are picked.
+            model = DEFAULT
         self._report = FrameReport()
         # Set by a caller that never writes into a frame again after passing it: then no buffer is copied.
         self.frames_stay = False
         # Unset by a caller that shows what the reports doubt.
         self.warns = True
-        self._tiles = Division(self.model, tile, max_memory, self.device, bfloat16=self.precision != "float32")
+        # A Model, or None until the first frame has picked one.
+        self.model: Any = None
+        if model is None:
+            _check_settings(DEFAULT, settings)
+            check_limits(tile, max_memory, self.device)
+            self.precision, self._why_precision = self._chosen()
+        else:
+            self._make(model, weights)
         self.reset()
 
-    def _chosen(self, asked: AskedPrecision, *, of_zoo: bool) -> Chosen:
-        if asked != "auto":
-            return Chosen(asked, "asked for")
+    def _make(self, model: str | Model | nn.Module, weights: Path | str | None = None) -> None:
+        """Make the model and what depends on it."""
+        name, of_zoo = str(model), isinstance(model, str) and ":" not in model
+        if isinstance(model, str):
+            _check_settings(model, self._given)
+            model = create_model(model, pretrained=weights is None, weights=weights, **self._given)
+        elif self._given or weights is not None:
+            names = ", ".join([*self._given, *(["weights"] if weights else [])])
+            raise InputError(f"{names}: expected a model's name, found a model")
+        if isinstance(model, nn.Module):
+            # Channels-last convolutions are about 1.5 times faster on a CPU.
+            model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+        self.model = as_model(model)
+        self._name = name if of_zoo else name_of(self.model)
+        self.precision, self._why_precision = self._chosen(of_zoo=of_zoo)
+        if self.precision == "int8":
+            if self.differentiable:
+                raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
+            quantize(self.model, self.device)
+        self._tiles = Division(self.model, *self._limits, self.device, bfloat16=self.precision != "float32")
+
+    @_in_turn
+    def pick(self, frame: Frame | None) -> None:
+        """Choose the model by a frame, if none was named or chosen before; otherwise the first frame does so.
+
+        Args:
+            frame: any of the shot, or ``None`` for features that are known to be filtered, see :func:`suitable_model`.
+
+        Raises:
+            InputError: the chosen model cannot be made with the settings, or memory is insufficient.
+        """
+        if self.model is None:
+            cascade = self.alpha or bool(self._given)
+            with torch.no_grad():
+                name, why = suitable_model(frame, still=self._frames == 1, cascade=cascade)
+            # Weights can be trained later, also if the caller infers only now.
+            with timed("pick", self.device), torch.inference_mode(False), torch.enable_grad():
+                self._make(name)
+            self._picked = f"{name}: {why}"
+            self._plan()
+
+    def _chosen(self, *, of_zoo: bool = True) -> Chosen:
+        if self._asked != "auto":
+            return Chosen(self._asked, "asked for")
         if self.differentiable:
             return Chosen("float32", "derivatives are wanted")
         if not of_zoo:
             return Chosen("float32", "what bfloat16 rounds in a model of your own is for you to judge")
-        return fastest_precision(self.device) if has_network(self.model) else Chosen("float32", "nothing is learnt")
+        # Every model that is picked has a network.
+        if self.model is None or has_network(self.model):
+            return fastest_precision(self.device)
+        return Chosen("float32", "nothing is learnt")
 
     @_in_turn
     def reset(
@@ -273,11 +318,17 @@ class Denoiser:
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
+        self._size, self._expected_layers = size, layers
+        self._plan()
+
+    def _plan(self) -> None:
+        """Foresee the memory of the shot, as far as it is known."""
+        size, buffers, layers = self._size, self._buffers, self._expected_layers
         # A single frame has no next one to read.
-        self.has_room_ahead = size is not None and frames != 1
+        self.has_room_ahead = size is not None and self._frames != 1 and self.model is not None
         # Whether frames are best handed over in files, because they do not fit into the memory beside their history.
         self.spills = False
-        if buffers is not None and size is not None:
+        if buffers is not None and size is not None and self.model is not None:
             streaming = self.has_history(buffers)
             # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
@@ -370,6 +421,9 @@ class Denoiser:
                 )
                 whole = frame.to(self.device).to(dtype).replace(hints=hints)
                 frame, void = self._prepared(whole, report)
+                if self.model is None:
+                    self.pick(frame)
+                report.model = self._picked
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 report.tiles = self._tiles.divide(self._shot(frame))
@@ -454,6 +508,8 @@ class Denoiser:
             ) from error
 
     def _dtype(self, frame: Frame) -> torch.dtype:
+        if self.model is None:
+            return torch.float32
         exact = self.differentiable and frame.color.dtype == torch.float64
         weights = self.model.parameters() if isinstance(self.model, nn.Module) else ()
         return torch.float64 if exact and all(each.dtype == torch.float64 for each in weights) else torch.float32
@@ -520,8 +576,7 @@ def denoise(
         albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
         normal: like ``color``, in [-1, 1].
         depth: ``(H, W)``, or with a channel axis.
-        model: see :class:`Denoiser`. By default it is ``"cascaded_v2"`` if weights or settings are passed;
-            otherwise that of :func:`mcdenoise.denoiser.suitable_model`.
+        model: see :class:`Denoiser`, also for the default.
         device: device to run on; the result is copied back from it.
         precision: see :class:`Denoiser`.
         extra: further buffers by name.
@@ -546,10 +601,7 @@ def denoise(
     settings = {name: value for name, value in others.items() if name not in OF_RENDERERS}
     buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
     frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
-    if model is None:
-        # Weights and settings are those of the default.
-        model = DEFAULT if settings else suitable_model(frame, still=True)[0]
-    _check_settings(model, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
+    _check_settings(model or DEFAULT, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
     denoiser = Denoiser(model, device=device, precision=precision, **settings)
     denoiser.reset(frames=1)
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()

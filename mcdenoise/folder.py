@@ -324,6 +324,9 @@ def _read_frames(
     on_read: Callable[[int], object] = lambda number: None,
 ) -> Iterator[tuple[int, Frame, _Times]]:
     """Read each frame, and the next one ahead if memory allows. Resets the denoiser."""
+    if denoiser.model is None:
+        denoiser.reset(frames=of or len(sequence))
+        denoiser.pick(sequence.telling_frame())
     needs = denoiser.model.needs
     wanted = needs.buffers | needs.uses
     buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)

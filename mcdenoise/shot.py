@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from collections.abc import Sequence as Sequential
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -220,17 +219,10 @@ def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, st
     """The name of the model that suits a shot, and the reason in words, see :func:`suitable_model`.
 
     Args:
-        sequence: the shot; its first frame without damage is read if the layout is one that may have features at the
-            pixel centres. (Blender's do not tell: with one sample they are those of the pixel centre, whatever the
-            filter is.)
+        sequence: the shot; see :meth:`mcdenoise.data.Sequence.telling_frame`.
         cascade: whether a cascade is required.
     """
-    if sequence.layout != "files":
-        for number in sequence.numbers:
-            # A damaged frame is not for this function to report.
-            with suppress(InputError):
-                return suitable_model(sequence.frame(number), still=len(sequence) == 1, cascade=cascade)
-    return suitable_model(None, cascade=cascade)
+    return suitable_model(sequence.telling_frame(), still=len(sequence) == 1, cascade=cascade)
 
 
 def check_threads(threads: int) -> None:

@@ -12,11 +12,13 @@ import pytest
 import torch
 from planes import plane
 
-from mcdenoise import denoise
+from mcdenoise import Denoiser, InputError, denoise
 from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import suitable_model
+from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
+from mcdenoise.models._weights import find_weights
 from mcdenoise.shot import ShotSettings, default_model
 
 LITTLE_NOISE = (
@@ -101,3 +103,62 @@ def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
         np.testing.assert_array_equal(picked, named)
     # Settings are those of the default.
     denoise(color, layout="CHW", alpha_min=0.5)
+
+
+def test_the_first_frame_picks_the_model_of_a_denoiser(small_sequence: Path) -> None:
+    sequence = open_sequence(small_sequence)
+    name, why = default_model(sequence)
+    denoiser, named = Denoiser(), Denoiser(name)
+    assert denoiser.model is None
+    for number in sequence.numbers:
+        frame = sequence.frame(number, reference=False)
+        assert torch.equal(denoiser(frame), named(frame))
+        assert denoiser.report.model == f"{name}: {why}"
+        assert f"model: {name}" in str(denoiser.report)
+        assert named.report.model == ""
+    # The next shots are denoised by the same model, whose weights a user may hold.
+    model = denoiser.model
+    denoiser.reset()
+    denoiser(Frame(sequence.frame(0).color))
+    assert denoiser.model is model
+    # A whole shot, as the command denoises it.
+    fresh = Denoiser()
+    assert len(list(denoised_frames(sequence, fresh))) == len(sequence)
+    assert fresh.report.model == f"{name}: {why}"
+
+
+def test_a_picked_model_obeys_the_arguments_of_the_denoiser() -> None:
+    frame = noisy_plane()
+    still = Denoiser()
+    still.reset(frames=1)
+    still(frame)
+    assert still.report.model.startswith("oidn_tuned_exact: ")
+    Denoiser().reset({"color"}, 3, (64, 96))
+    arguments: dict[str, Any]
+    for arguments in ({"alpha_min": 0.5}, {"alpha": True}):
+        denoiser = Denoiser(**arguments)
+        denoiser(frame)
+        assert denoiser.report.model.startswith("cascaded_v2: ")
+    tiled = Denoiser(tile=64, precision="bfloat16")
+    assert tiled.precision == "bfloat16"
+    tiled(frame)
+    assert "asked for" in tiled.report.tiles
+    learns = Denoiser(differentiable=True)
+    with torch.inference_mode():
+        learns(frame)
+    learns.reset()
+    learns(frame).sum().backward()
+    assert all(each.grad is not None for each in learns.model.parameters() if each.requires_grad)
+    wrong: dict[str, Any]
+    for wrong in ({"tile": 65}, {"max_memory": -1}, {"alfa_min": 0.5}, {"tile": 64, "max_memory": 2.0}):
+        with pytest.raises(InputError):
+            Denoiser(**wrong)
+    # An invalid frame picks nothing.
+    denoiser = Denoiser()
+    with pytest.raises(InputError):
+        denoiser(frame.replace(depth=torch.full_like(frame.color[:, :1], torch.nan)))
+    assert denoiser.model is None
+
+
+def test_weights_bring_their_model() -> None:
+    assert Denoiser(weights=find_weights("cascaded_v2_micro"))._name == "cascaded_v2_micro"

@@ -143,7 +143,7 @@ def test_weights_of_too_many_digits_are_told(small_sequence: Path) -> None:
 WRONG: list[dict[str, Any]] = [
     *({"tile": value} for value in ("64", 64.0, True, [64], -1, 65)),
     *({"max_memory": value} for value in ("1", True, float("nan"), -1, 0, [1])),
-    *({"model": value} for value in (None, 5, "", torch.zeros(3), Denoiser, [], Frame)),
+    *({"model": value} for value in (5, "", torch.zeros(3), Denoiser, [], Frame)),
     *({"device": value} for value in (None, [], "nowhere", "meta", 1.5)),
     *({"precision": value} for value in (None, 16, [], "float16")),
     *({"weights": value} for value in (5, b"x", "nothing.safetensors", ".")),

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Sequential
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -93,6 +94,17 @@ class Sequence:
         chosen = set(numbers)
         referenced = [number for number in self.reference_numbers if number in chosen]
         return replace(self, numbers=list(numbers), reference_numbers=referenced)
+
+    def telling_frame(self) -> Frame | None:
+        """The first frame without damage, by which to choose a model; ``None`` for files of a renderer.
+
+        Features of those do not tell: with one sample they are those of the pixel centre, whatever the filter is.
+        """
+        for number in self.numbers if self.layout != "files" else ():
+            # A damaged frame is reported when it is denoised.
+            with suppress(InputError):
+                return self.frame(number, reference=False)
+        return None
 
     @_any_values
     def frame(
