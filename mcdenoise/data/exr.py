@@ -161,6 +161,8 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ExrHeader]:
     if found:
         file.close()
         raise _unreadable(path, found, "render a flat EXR of at most 2^28 pixels")
+    # Errors of attributes, which the pixels do not need, would be taken for those of the pixels.
+    pending_error(file)
     size, origin = (spec.height, spec.width), (spec.y, spec.x)
     return file, ExrHeader(size, list(spec.channelnames), picture_metadata(spec), origin)
 

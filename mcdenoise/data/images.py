@@ -261,8 +261,8 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
             channels = tuple(spec.channelnames)
             metadata = metadata or picture_metadata(spec)
-            part_name = str(spec.getattribute("oiio:subimagename") or spec.getattribute("name") or "")
-            space = str(spec.getattribute("oiio:ColorSpace") or "").lower()
+            part_name = _text(spec, "oiio:subimagename") or _text(spec, "name")
+            space = _text(spec, "oiio:ColorSpace").lower()
         except UnicodeDecodeError as error:
             raise _refused(path, "names that are no text") from error
         pixels = spec.width * spec.height
@@ -293,6 +293,12 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
     if not parts:
         raise _refused(path, "no image")
     return ImageHeader(name, tuple(parts), metadata)
+
+
+def _text(spec: oiio.ImageSpec, name: str) -> str:
+    """A text in a header; empty if there is none of that name, or something else."""
+    value = spec.getattribute(name)
+    return value if isinstance(value, str) else ""
 
 
 def _refused(path: Path, found: str, advice: str = "render a flat image of at most 2^28 pixels") -> InputError:

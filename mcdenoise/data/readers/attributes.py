@@ -1,7 +1,8 @@
 """Copying EXR attributes that OpenEXR's Python module cannot represent.
 
-The module fails on text in Latin-1 or Shift-JIS, and on some attribute types. A copy of the file holds a placeholder
-text of the same length for each such attribute, and the original bytes are put back into the written file.
+The module fails on text in Latin-1 or Shift-JIS, on a frame rate of 24/0, on an attribute of the format of another type
+than the format says, and on some types. A copy of the file holds a placeholder text of the same length for each such
+attribute, and the original bytes are put back into the written file.
 """
 
 from __future__ import annotations
@@ -14,9 +15,44 @@ from pathlib import Path
 from typing import NamedTuple
 
 _MULTI_PART = 0x1000
-_TEXTS = {b"string", b"stringvector"}
-# Attribute types that the module does not know, or drops.
-_UNKNOWN = {b"bytes", b"deepImageState", b"idmanifest"}
+# The types that the module copies, with their sizes in bytes if all values have the same.
+_COPIED = {
+    **dict.fromkeys((b"string", b"stringvector", b"floatvector", b"chlist")),
+    **dict.fromkeys((b"compression", b"lineOrder"), 1),
+    **dict.fromkeys((b"int", b"float"), 4),
+    **dict.fromkeys((b"double", b"rational", b"timecode", b"v2i", b"v2f"), 8),
+    **dict.fromkeys((b"v3i", b"v3f"), 12),
+    **dict.fromkeys((b"v2d", b"box2i", b"box2f"), 16),
+    **{b"tiledesc": 9, b"v3d": 24, b"chromaticities": 32, b"m33f": 36, b"m44f": 64, b"m33d": 72, b"m44d": 128},
+}
+# The types of attributes of the format; the module misreads others under these names.
+_OF_FORMAT = {
+    b"adoptedNeutral": b"v2f",
+    b"cameraColorBalance": b"v2f",
+    b"channels": b"chlist",
+    b"chromaticities": b"chromaticities",
+    b"chunkCount": b"int",
+    b"compression": b"compression",
+    b"dataWindow": b"box2i",
+    b"displayWindow": b"box2i",
+    b"dwaCompressionLevel": b"float",
+    b"envmap": b"envmap",
+    b"lineOrder": b"lineOrder",
+    b"name": b"string",
+    b"originalDataWindow": b"box2i",
+    b"pixelAspectRatio": b"float",
+    b"preview": b"preview",
+    b"screenWindowCenter": b"v2f",
+    b"screenWindowWidth": b"float",
+    b"sensorAcquisitionRectangle": b"box2i",
+    b"sensorCenterOffset": b"v2f",
+    b"sensorOverallDimensions": b"v2f",
+    b"tiles": b"tiledesc",
+    b"type": b"string",
+    # Flat images, and no others are read, have none.
+    b"version": b"",
+}
+_ONLY_OF_FORMAT = {b"chlist", b"compression", b"lineOrder", b"tiledesc"}
 
 
 class Record(NamedTuple):
@@ -75,8 +111,12 @@ def readable(source: Path, copy: Path) -> Iterator[tuple[Path, dict[tuple[int, b
         if found:
             pixels = bytearray(content)
             for part, name, _, start, _, end in found:
+                # A name of the format must not have a text.
+                name = b"~" + name[1:] if name in _OF_FORMAT else name
                 strange[part, name] = content[start:end]
                 rest = end - start - len(name) - len(b"\0string\0....")
+                if rest < 0:
+                    raise ValueError("damaged header")
                 text = name + b"\0string\0" + rest.to_bytes(4, "little") + b"." * rest
                 pixels[start:end] = text
     if not strange:
@@ -101,12 +141,19 @@ def put_back(target: Path, strange: dict[tuple[int, bytes], bytes]) -> None:
 
 
 def _is_strange(record: Record, content: mmap.mmap) -> bool:
-    if record.kind in _UNKNOWN:
+    name, kind, value = record.name, record.kind, content[record.value : record.end]
+    if (
+        kind not in _COPIED
+        or _OF_FORMAT.get(name, kind) != kind
+        or (kind in _ONLY_OF_FORMAT and name not in _OF_FORMAT)
+    ):
         return True
-    if record.kind not in _TEXTS:
-        return False
+    if len(value) != (_COPIED[kind] or len(value)):
+        return True
+    if kind == b"rational":
+        return not any(value[4:])
     try:
-        content[record.value : record.end].decode()
+        value.decode() if b"string" in kind else b""
     except UnicodeDecodeError:
         return True
-    return False
+    return b"vector" in kind and len(value) <= 4

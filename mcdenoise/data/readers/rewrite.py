@@ -17,8 +17,6 @@ from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
 
-_LIBRARY_ERRORS = (RuntimeError, ValueError, TypeError, OSError, InputError)
-
 
 def write_like(
     source: Path,
@@ -76,7 +74,7 @@ def _write_exr(
         with readable(source, target.with_suffix(".copy.exr")) as (path, strange):
             file = OpenEXR.File(str(path), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
-    except _LIBRARY_ERRORS as error:
+    except Exception as error:
         return f"{source} cannot be read again: {_first_line(error)}"
     if not whole:
         return f"{source} has changed meanwhile, or has parts that cannot be written again"
@@ -100,7 +98,7 @@ def _write_exr(
         # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
         for index, each in enumerate(written):
             read_channels(target, {index: each.channels}, slice(each.size[0] - 1, each.size[0]))
-    except _LIBRARY_ERRORS as error:
+    except Exception as error:
         return _first_line(error)
     return "" if len(written) == len(expected) else "incomplete"
 

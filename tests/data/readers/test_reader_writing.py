@@ -17,6 +17,7 @@ import pytest
 
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence
+from mcdenoise.data.exr import read_exr
 from mcdenoise.data.readers.attributes import records
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.folder import denoise_sequence
@@ -270,8 +271,53 @@ def with_attribute(content: bytes, name: bytes, kind: bytes, value: bytes) -> by
     ids=["latin-1", "shift-jis", "stringvector", "deepImageState", "bytes", "floatvector", "own"],
 )
 def test_an_attribute_of_any_kind_stays(kind: bytes, value: bytes, save: Callable[..., Path], tmp_path: Path) -> None:
+    check_attribute_stays(b"thing", kind, value, save, tmp_path)
+
+
+INVALID = [
+    (b"framesPerSecond", b"rational", (24).to_bytes(4, "little") + bytes(4)),
+    (b"keyCode", b"keycode", b"\xff" * 28),
+    (b"timeCode", b"timecode", b"\xff" * 8),
+    (b"thing", b"envmap", b"\7"),
+    (b"thing", b"compression", b"\7"),
+    (b"thing", b"stringvector", b""),
+    (b"preview", b"preview", bytes(8)),
+    *(
+        (name, kind, value)
+        for kind, value in ((b"string", b"words of text"), (b"float", b"\0\0\xc0\x7f"), (b"m33f", bytes(36)))
+        for name in (
+            b"adoptedNeutral",
+            b"chromaticities",
+            b"chunkCount",
+            b"envmap",
+            b"framesPerSecond",
+            b"keyCode",
+            b"multiView",
+            b"originalDataWindow",
+            b"preview",
+            b"sensorCenterOffset",
+            b"textureformat",
+            b"tiles",
+            b"timeCode",
+            b"version",
+            b"worldToCamera",
+            b"wrapmodes",
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "kind", "value"), INVALID)
+def test_an_attribute_that_is_invalid_stays_and_its_pixels_are_read(
+    name: bytes, kind: bytes, value: bytes, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    source = check_attribute_stays(name, kind, value, save, tmp_path)
+    assert read_exr(source)[0].shape == (*SIZE, 4)
+
+
+def check_attribute_stays(name: bytes, kind: bytes, value: bytes, save: Callable[..., Path], tmp_path: Path) -> Path:
     source = save(tmp_path / "a" / "still.exr", {name: noise(*SIZE) for name in "RGBZ"}, "half", owner="Zoë")
-    source.write_bytes(with_attribute(source.read_bytes(), b"thing", kind, value))
+    source.write_bytes(with_attribute(source.read_bytes(), name, kind, value))
     (tmp_path / "out").mkdir()
     sequence = open_sequence(source)
     sequence.frame(0).validate()
@@ -282,9 +328,10 @@ def test_an_attribute_of_any_kind_stays(kind: bytes, value: bytes, save: Callabl
         for content in (source.read_bytes(), path.read_bytes())
     ]
     assert attributes[0] == attributes[1]
-    assert attributes[1][0, b"thing"].endswith(value)
+    assert attributes[1][0, name].endswith(value)
     np.testing.assert_array_equal(open_sequence(path).frame(0).color[0].permute(1, 2, 0).numpy(), rainbow(*SIZE))
     assert [each.name for each in (tmp_path / "out").iterdir()] == ["still.exr"]
+    return source
 
 
 def test_attributes_of_several_parts_stay(rendered: Path, tmp_path: Path) -> None:
