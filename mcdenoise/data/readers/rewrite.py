@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,15 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 
-from mcdenoise.data.exr import Image, pending_error, within_half
+from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error, within_half
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
 from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 from mcdenoise.errors import InputError
+
+# Names of the channels that DWA compression rounds, and its usual level.
+_DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45
 
 
 def write_like(
@@ -90,6 +94,8 @@ def _write_exr(
                 return f"it has a channel '{name}' already"
             channels[name] = OpenEXR.Channel(name, _stored(image, kind))
         main.channels = channels
+    for each in file.parts:
+        _leave_room(each)
     try:
         file.write(str(target))
         if strange:
@@ -101,6 +107,27 @@ def _write_exr(
     except Exception as error:
         return _first_line(error)
     return "" if len(written) == len(expected) else "incomplete"
+
+
+def _leave_room(part: Any) -> None:
+    """Clamp pixels that DWA compression, which holds halves of any type and rounds them, would turn into infinity."""
+    if part.header["compression"] not in (OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION):
+        return
+    # Random stars and noise came back up to 1.03 times as bright at a level of 45, 1.1 times at 200, 1.6 times at 1000.
+    largest = LARGEST_HALF / (1 + float(part.header.get("dwaCompressionLevel", _DWA_LEVEL)) / 1000)
+    for name, channel in part.channels.items():
+        pixels = channel.pixels
+        if name.rpartition(".")[2].lower() not in _DWA_ROUNDS or pixels.dtype == np.uint32:
+            continue
+        above = np.isfinite(pixels) & (np.abs(pixels) > largest)
+        if above.any():
+            channel.pixels = np.where(above, np.sign(pixels) * largest, pixels).astype(pixels.dtype)
+            # The text is the same for all frames, so that it is told once.
+            warnings.warn(
+                f"DWA compression stores half floats and rounds them: brighter pixels are clamped to {largest:.0f} "
+                f"('{name}'); store the shot with ZIP compression to keep them",
+                stacklevel=2,
+            )
 
 
 def _first_line(error: Exception) -> str:

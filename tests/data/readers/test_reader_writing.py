@@ -545,3 +545,35 @@ def test_a_file_that_changed_meanwhile_is_told(
     source.unlink()
     assert "b.exr: cannot be written" in refused(write_like, source, target, replaced, added={})
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("level", [None, 10.0, 200.0, 1000.0])
+@pytest.mark.parametrize("compression", [OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION])
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_bright_pixels_stay_finite_under_dwa(tmp_path: Path, compression: Any, level: float | None, kind: Any) -> None:
+    source, target = tmp_path / "in.exr", tmp_path / "out.exr"
+    rows = np.zeros((64, 64), kind)
+    header = {"compression": compression, "type": OpenEXR.scanlineimage}
+    header |= {} if level is None else {"dwaCompressionLevel": level}
+    depth = np.full((64, 64), 1e7, np.float32)
+    OpenEXR.File(header, {"R": rows, "G": rows, "B": rows, "Z": depth}).write(str(source))
+    for seed, bright in enumerate((0.1, 0.5, 1.0)):
+        image = np.where(np.random.default_rng(seed).random((64, 64, 3)) < bright, 1e5, 0.01).astype(np.float32)
+        with pytest.warns(UserWarning, match="DWA"):
+            write_like(source, target, {(0, name): image[..., i] for i, name in enumerate("RGB")}, added={})
+        ((_, channels),) = stored(target)
+        written = np.stack([channels[name] for name in "RGB"], -1).astype(np.float64)
+        assert np.isfinite(written).all()
+        assert written[image > 1].mean() > 25_000
+        np.testing.assert_array_equal(channels["Z"], depth)
+
+
+def test_what_is_not_bright_is_not_clamped(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    source, target = tmp_path / "in.exr", tmp_path / "out.exr"
+    image = np.full((64, 64), 60_000, np.float32)
+    OpenEXR.File({"compression": OpenEXR.DWAA_COMPRESSION, "type": OpenEXR.scanlineimage}, {"R": image}).write(
+        str(source)
+    )
+    write_like(source, target, {(0, "R"): image}, added={})
+    assert not recwarn
+    np.testing.assert_allclose(stored(target)[0][1]["R"], 60_000, rtol=0.01)
