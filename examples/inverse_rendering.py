@@ -9,7 +9,7 @@ image. There are two losses: the relative squared error, and the absolute differ
 which is common for its robustness against bright pixels. Noise biases the latter, because the mean of a concave
 function of a noisy image is not that function of its mean.
 
-If Mitsuba finds an LLVM library, the script uses Mitsuba's derivatives (``dr.wrap``). Otherwise it uses finite
+If Mitsuba finds LLVM 19 or newer, the script uses Mitsuba's derivatives (``dr.wrap``). Otherwise it uses finite
 differences with equal random numbers in the scalar variant, which are exact up to rounding here, because no path
 depends on the reflectance and its three channels do not mix.
 

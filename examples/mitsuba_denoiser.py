@@ -5,8 +5,8 @@
 `still` renders a Cornell box at a few samples per pixel, with the albedo and the normals of the `aov` integrator, and
 denoises the bitmap. `optimise` finds the color of the walls from an image of them: each step renders a new image at one
 sample per pixel, and the gradient of the loss propagates back through the denoiser into Mitsuba. It needs a
-differentiable variant, `llvm_ad_rgb` (with an LLVM library that is new enough for the processor) or `cuda_ad_rgb`, and
-is skipped with a message if neither works.
+differentiable variant, `cuda_ad_rgb` or `llvm_ad_rgb`, which needs LLVM 19 or newer, and is skipped with a message if
+neither works.
 
 Measured at 96x96: at 4 samples per pixel, SMAPE falls from 0.314 to 0.148; in llvm_ad_rgb, after 60 steps, the maximum
 error of the walls' reflectance has fallen from 0.586 to 0.007.
@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mcdenoise.integrations.mitsuba import MitsubaDenoiser
-from mcdenoise.scenes.render.tracer import first_working
+from mcdenoise.scenes.render.tracer import LLVM, first_working
 
 WALLS = "white.reflectance.value"
 START = (0.3, 0.3, 0.3)
@@ -111,9 +111,7 @@ def main() -> None:
 
     variant = first_working(("cuda_ad_rgb", "llvm_ad_rgb"))
     if variant is None:
-        print(
-            "optimise: skipped, as no differentiable variant of Mitsuba works here (no GPU, and no LLVM or an old one)"
-        )
+        print(f"optimise: skipped, as no differentiable variant of Mitsuba works here; {LLVM}")
         return
     mi.set_variant(variant)
     errors = optimise(options.size, options.steps)

@@ -478,7 +478,7 @@ def test_mitsuba_denoiser_denoises_a_still_and_optimises_where_mitsuba_different
         assert channels == ["R", "G", "B"]
     found = re.search(r"error of the reflectance ([\d.]+), after 4 steps ([\d.]+)$", second)
     if found is None:
-        assert second.startswith("optimise: skipped, as no variant of Mitsuba that differentiates runs here")
+        assert "LLVM" in second
         pytest.skip("the still was denoised; " + second)
     assert float(found[2]) < float(found[1])
 

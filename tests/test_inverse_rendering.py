@@ -69,10 +69,10 @@ def test_descent_with_and_without_the_denoiser(
 
 
 def test_derivative_of_mitsuba_is_the_same_in_the_mean(example: ModuleType) -> None:
-    from mcdenoise.scenes.render.tracer import first_working
+    from mcdenoise.scenes.render.tracer import LLVM, first_working
 
     if first_working(("llvm_ad_rgb",)) is None:
-        pytest.skip("Mitsuba's llvm_ad_rgb does not run here: no LLVM, or one that is too old for the processor")
+        pytest.skip(LLVM)
     scalar, own = (torch.stack(derivative(example, variant)) for variant in ("scalar_rgb", "llvm_ad_rgb"))
     # The mean of 288 paths is known to a quarter.
     assert ((own.mean(0) / scalar.mean(0)).log().abs() < 0.7).all()

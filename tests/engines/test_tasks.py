@@ -44,7 +44,7 @@ def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> Non
 
 
 def test_no_workers_are_refused() -> None:
-    with pytest.raises(InputError, match="--workers: expected at least 1, found 0"):
+    with pytest.raises(InputError, match=r"--workers: .*0"):
         LocalEngine(0)
 
 

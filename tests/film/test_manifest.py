@@ -145,7 +145,7 @@ def test_invalid_manifests_are_refused_in_one_line(
 )
 def test_a_manifest_that_is_none(tmp_path: Path, make: Callable[[Path], object], expected: str) -> None:
     make(tmp_path / "film.toml")
-    with pytest.raises(InputError, match=r"film\.toml: expected") as caught:
+    with pytest.raises(InputError, match=r"film\.toml:") as caught:
         read_film(tmp_path / "film.toml")
     assert expected in str(caught.value)
 

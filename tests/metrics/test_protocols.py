@@ -202,5 +202,5 @@ def test_small_images_have_no_five_scales() -> None:
 @pytest.mark.parametrize("name", PROTOCOLS)
 def test_images_must_agree(name: ProtocolName) -> None:
     for metric in PROTOCOLS[name].metrics.values():
-        with pytest.raises(ValueError, match="reference: expected the shape of image"):
+        with pytest.raises(ValueError, match="reference:"):
             metric.function(torch.rand(1, 3, 20, 20), torch.rand(1, 3, 20, 21))

@@ -98,9 +98,9 @@ def test_warped_errors_take_pairs() -> None:
     clip, reference = clips(frames=3)
     still = torch.zeros(2, 2, 5, 6, dtype=torch.float64)
     for call in (lambda: warping_error_srgb(clip, still), lambda: warped_rmse_srgb(clip, reference, still)):
-        with pytest.raises(ValueError, match=r"clip: expected \(B, 2, 3, H, W\), found \(2, 3, 3, 5, 6\)"):
+        with pytest.raises(ValueError, match=r"clip: .*\(2, 3, 3, 5, 6\)"):
             call()
-    with pytest.raises(ValueError, match="reference: expected the shape of image"):
+    with pytest.raises(ValueError, match="reference:"):
         warped_rmse_srgb(clip[:, :2], reference, still)
 
 

@@ -248,3 +248,10 @@ def test_the_cost_of_the_pixel_network_written_out() -> None:
     with FlopCounterMode(display=False) as counter:
         PixelNetwork(width)(frame_of(64, 64))
     assert counter.get_total_flops() / 2 / 64**2 == pytest.approx(full + encoder + decoder + fusions, rel=1e-6)
+
+
+@torch.no_grad()
+def test_buffers_of_ones_own_change_nothing() -> None:
+    model, frame = small("cascaded_v2_micro"), frame_of(24, 40)
+    expected = model(frame)[0].image
+    assert torch.equal(model(frame.replace(extra={"matte": torch.rand(1, 2, 24, 40)}))[0].image, expected)

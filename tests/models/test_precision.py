@@ -91,7 +91,7 @@ def test_the_environment_variable_chooses_the_precision(monkeypatch: pytest.Monk
         monkeypatch.setenv(ENVIRONMENT, precision)
         assert fastest_precision(CPU).precision == precision
     monkeypatch.setenv(ENVIRONMENT, "int4")
-    with pytest.raises(InputError, match="MCDENOISE_PRECISION: expected one of float32, bfloat16, found 'int4'"):
+    with pytest.raises(InputError, match=r"MCDENOISE_PRECISION: .*'int4'"):
         fastest_precision(CPU)
 
 
@@ -137,7 +137,7 @@ def test_who_gets_it(measured: list[float]) -> None:
         Denoiser("cascaded_v2_micro", precision="float32"),
     ):
         assert others.precision == "float32"
-    with pytest.raises(InputError, match="precision: expected one of auto, float32, bfloat16, int8, found 'int4'"):
+    with pytest.raises(InputError, match=r"precision: .*'int4'"):
         Denoiser("cascaded_v2_micro", precision="int4")  # type: ignore[arg-type]
 
 

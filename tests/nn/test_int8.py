@@ -124,7 +124,7 @@ def test_ranges_of_another_network_are_refused() -> None:
         unet.quantize()
     unet.calibrate(x, given)
     assert unet.ranges is not None
-    with pytest.raises(ValueError, match=r"ranges: expected shape \(30, 2\), found \(29, 2\)"):
+    with pytest.raises(ValueError, match=r"ranges: .*\(29, 2\)"):
         Int8UNet(unet.encoder, unet.up, unet.decoder, unet.ranges[1:])
 
 

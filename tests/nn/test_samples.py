@@ -132,13 +132,11 @@ def test_samples_that_are_no_radiance() -> None:
     samples = torch.tensor([-1.0, 2.0, torch.inf, torch.nan, -torch.inf, 0.5]).reshape(1, 2, 3, 1, 1)
     found = samples_of(Frame(torch.ones(1, 3, 1, 1), samples=samples))
     assert found.flatten().tolist() == pytest.approx([0, 2, LARGEST_RADIANCE, 0, 0, 0.5])
-    with pytest.raises(
-        InputError, match=r"buffer 'samples': expected \(B, S, C, H, W\) with at least 3 channels, found"
-    ):
+    with pytest.raises(InputError, match=r"buffer 'samples'"):
         samples_of(Frame(torch.ones(1, 3, 1, 1), samples=samples[:, :, :2]))
 
 
 @pytest.mark.parametrize("setting", ["width", "rounds", "convolutions"])
 def test_sizes_of_nothing_are_refused(setting: str) -> None:
-    with pytest.raises(InputError, match=f"{setting}: expected at least 1, found 0"):
+    with pytest.raises(InputError, match=rf"{setting}: .*0"):
         SampleEmbedding(CHANNELS, **{"width": 4, "rounds": 1, "convolutions": 1, setting: 0})

@@ -213,7 +213,7 @@ def test_another_backend_may_be_used_for_a_while() -> None:
     large, small = torch.rand(2, 3, 64, 64), torch.rand(1, 3, 4, 4)
     with ops.use("torch"):
         assert chosen(large) == "torch"
-        with pytest.raises(ValueError, match="backend: expected one of"), ops.use("c"):  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="backend:"), ops.use("c"):  # type: ignore[arg-type]
             pytest.fail("entered")
         with ops.use("numba", strict=False):
             assert chosen(small) == "numba"
@@ -250,7 +250,7 @@ def test_denormal_numbers_are_flushed_in_derivatives_and_nowhere_else() -> None:
 
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
     image, kernel = torch.rand(1, 3, 4, 5), torch.rand(1, 9, 4, 5)
-    with pytest.raises(ValueError, match="backend: expected one of torch, numba, triton, found 'cuda'"):
+    with pytest.raises(ValueError, match=r"backend: .*'cuda'"):
         by("cuda", ops.kernel_conv)(image, kernel)
     with pytest.raises(ValueError, match="found 'numba', which runs on the CPU, not on meta"):
         by("numba", ops.kernel_conv)(image.to("meta"), kernel.to("meta"))

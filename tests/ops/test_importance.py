@@ -89,5 +89,5 @@ def test_derivatives_of_a_steep_map_are_finite(scale: float) -> None:
 
 @pytest.mark.parametrize("kernel_size", [1, 4, -3])
 def test_a_window_without_neighbours_or_centre_is_refused(kernel_size: int) -> None:
-    with pytest.raises(ValueError, match=f"kernel_size: expected odd and at least 3, found {kernel_size}"):
+    with pytest.raises(ValueError, match=rf"kernel_size: .*{kernel_size}"):
         importance_filter(drawn(3, 4, 5), drawn(1, 4, 5), kernel_size=kernel_size)

@@ -274,7 +274,7 @@ def test_fusion_of_logarithms_pixel_by_pixel(height: int, width: int, backend: s
 
 def test_logarithms_have_no_residual() -> None:
     fine = torch.ones(1, 3, 4, 4)
-    with pytest.raises(ValueError, match="residual: expected None where logarithms are taken"):
+    with pytest.raises(ValueError, match="residual:"):
         network.gated_fusion(
             fine, fine[..., ::2, ::2], torch.ones(1, 6, 3, 3), torch.ones(1), residual=fine, logarithms=True
         )

@@ -173,14 +173,14 @@ def copied(folder: Path, target: Path) -> Path:
 
 
 def test_a_folder_without_results(tmp_path: Path):
-    with pytest.raises(InputError, match=r"results\.json: expected the results of `mcdenoise benchmark`"):
+    with pytest.raises(InputError, match=r"results\.json:"):
         write_report(tmp_path)
 
 
 def test_pictures_of_another_size(folder: Path, tmp_path: Path):
     copy = copied(folder, tmp_path / "copy")
     save(copy, "first", "ours", FRAMES[0], np.zeros((8, 8, 3), np.float32))
-    with pytest.raises(InputError, match=r"ours.3\.exr: expected an RGB picture of 96x64, found 3 channels of 8x8"):
+    with pytest.raises(InputError, match=r"ours.3\.exr: .*3 channels of 8x8"):
         report_writing._galleries(copy, Results.read(copy))
 
 

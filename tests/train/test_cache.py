@@ -440,7 +440,7 @@ def test_a_damaged_frame_leaves_nothing_half_made(small_sequence: Path, tmp_path
     image, channels, _ = read_exr(inputs / "albedo3.exr")
     image[4, 5] = np.nan
     write_exr(inputs / "albedo3.exr", image, channels)
-    with pytest.raises(InputError, match=r"plane, frame 3: buffer 'albedo': expected finite values"):
+    with pytest.raises(InputError, match=r"plane, frame 3: buffer 'albedo':"):
         opened(small_sequence, tmp_path / "cache")
     assert entries(tmp_path / "cache") == []
 

@@ -129,7 +129,7 @@ def test_a_constant_error_has_no_gradient_and_no_flicker() -> None:
         for temporal_weight in (0.0, 0.1, 5.0):
             found = rae_loss(math.e * ones - 1, 0 * ones, temporal_weight=temporal_weight)
             assert found.item() == pytest.approx(0.8)
-    with pytest.raises(ValueError, match=r"image: expected shape \(1, 2, 3, 4, 4\) as reference"):
+    with pytest.raises(ValueError, match=r"image:"):
         rae_loss(torch.ones(1, 1, 3, 4, 4), torch.ones(1, 2, 3, 4, 4))
 
 
@@ -151,5 +151,5 @@ def test_default_weights_are_those_of_the_paper() -> None:
     assert stage_weights({}, Output(image)) == {"image": 1}
     assert stage_weights({}, Output(image, {"accumulated": image, "initial": image})) == BOTH
     assert stage_weights({"accumulated": 2}, Output(image, {"accumulated": image})) == {"accumulated": 2}
-    with pytest.raises(InputError, match=r"losses: expected stages of the model \(image\), found 'initial'"):
+    with pytest.raises(InputError, match=r"losses: .*'initial'"):
         stage_weights({"initial": 1}, Output(image))

@@ -25,6 +25,11 @@ from mcdenoise.errors import InputError
 Scene: TypeAlias = str | Path | Mapping[str, Any]
 
 VARIANTS = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
+# What a person without Mitsuba's derivatives, or its fast variant on a CPU, has to do.
+LLVM = (
+    "Mitsuba's llvm_ad_rgb needs LLVM 19 or newer (Debian: apt-get install libllvm19); set DRJIT_LIBLLVM_PATH to its "
+    "library, such as /usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"
+)
 RR_DEPTH = 5
 _SEE_THROUGH_LAYERS = 8
 _WAVEFRONT = 2**20  # paths traced at once: enough to fill the vector units, small enough for a laptop's memory
@@ -71,7 +76,8 @@ class Tracer:
         try:
             mi.set_variant(variant)
         except ImportError as error:
-            raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}") from error
+            advice = f"; {LLVM}" if variant.startswith("llvm") else ""
+            raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}{advice}") from error
         self._dr = importlib.import_module("drjit")
         # On a single core, parallel loading of a scene whose parts refer to each other deadlocks.
         self._dr.set_thread_count(max(2, self._dr.thread_count()))
