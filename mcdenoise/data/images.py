@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -55,6 +56,37 @@ _CHROMA = {"ry", "by"}
 oiio.attribute("limits:channels", _LARGEST_CHANNELS)
 
 
+class Window(NamedTuple):
+    """Pixels from a first row and column to those before an end, in the display window's coordinates."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.bottom - self.top, self.right - self.left
+
+    def joined(self, other: Window) -> Window:
+        """The smallest window with both."""
+        low, high = map(min, self[:2], other[:2]), map(max, self[2:], other[2:])
+        return Window(*low, *high)
+
+    def of(self, image: Image, own: Window, fill: float = 0.0) -> Image:
+        """The pixels of this window, from an ``(H, W, C)`` image of another; filled where that has none."""
+        if self == own:
+            return image
+        found = np.full((*self.size, *image.shape[2:]), fill, image.dtype)
+        top, left = max(self.top, own.top), max(self.left, own.left)
+        bottom, right = max(top, min(self.bottom, own.bottom)), max(left, min(self.right, own.right))
+        found[top - self.top : bottom - self.top, left - self.left : right - self.left] = image[
+            top - own.top : bottom - own.top, left - own.left : right - own.left
+        ]
+        return found
+
+
 @dataclass(frozen=True)
 class Part:
     """One image (part) of a file.
@@ -66,6 +98,7 @@ class Part:
         channels: names of the channels, R, G, B first.
         integers: channels that are stored as integers, such as object ids.
         display_referred: whether the pixels are display values (sRGB), as in an 8-bit PNG.
+        display: height, width, first row and column of the display window.
     """
 
     name: str
@@ -74,6 +107,13 @@ class Part:
     channels: tuple[str, ...]
     integers: frozenset[str]
     display_referred: bool
+    display: tuple[int, int, int, int] = (0, 0, 0, 0)
+
+    @property
+    def window(self) -> Window:
+        """The data window."""
+        (height, width), (top, left) = self.size, self.origin
+        return Window(top, left, top + height, left + width)
 
 
 @dataclass(frozen=True)
@@ -286,7 +326,8 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)
         display = name in ("png", "tiff") and kinds[0] in ("uint8", "uint16") and "lin" not in space
         size, origin = (spec.height, spec.width), (spec.y, spec.x)
-        parts.append(Part(part_name, size, origin, channels, integers, display))
+        whole = (spec.full_height, spec.full_width, spec.full_y, spec.full_x)
+        parts.append(Part(part_name, size, origin, channels, integers, display, whole))
         if name != "openexr":
             break
     pending_error(file)

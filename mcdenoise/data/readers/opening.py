@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
 from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
+from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import FittedCamera, fit_camera, motion_to, read_as
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
@@ -154,7 +155,7 @@ def open_result(path: Path) -> Result:
 
 
 def _check(shot: RenderedFiles) -> None:
-    """Check that every frame has every buffer, with the same data window."""
+    """Check that every frame has every buffer, in the same display window; join data windows that differ."""
     color = shot.choice.layers["color"]
     main = shot.part(color)
     for name, layer in sorted(shot.choice.layers.items()):
@@ -166,18 +167,33 @@ def _check(shot: RenderedFiles) -> None:
                 f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
             )
         part = shot.part(layer)
-        if (part.size, part.origin) != (main.size, main.origin):
+        if part.window != main.window and part.display != main.display:
             raise InputError(
                 f"{next(iter(files.values()))}: expected '{name}' in the pixels of the color "
                 f"({_window(main)}), found {_window(part)}; render all layers in one window, or leave this one "
                 f"out with --map {name}="
             )
-    names = {layer: set(layer.channels) for layer in shot.choice.layers.values()}
+    layers = {*shot.choice.layers.values(), *shot.choice.written}
+    windows: list[Window] = []
+    written: list[Window] = []
+    kept = {color, *shot.choice.written}
     for group, own in enumerate(shot.groups):
-        used = [layer for layer in names if layer.group == group]
+        used = [layer for layer in layers if layer.group == group]
         for number in shot.numbers if used else []:
             if number in own.files:
-                _check_header(own.files[number], read_image_header(own.files[number]), used, main)
+                header = read_image_header(own.files[number])
+                _check_header(own.files[number], header, used, main)
+                windows += (header.parts[layer.part].window for layer in used)
+                written += (header.parts[layer.part].window for layer in used if layer in kept)
+    if len(set(windows)) > 1:
+        shot.window = functools.reduce(Window.joined, written)
+    reference = shot.choice.layers.get("reference", color)
+    for number in shot.reference_numbers:
+        if shot.window_of(reference, number) != shot.window_of(color, number):
+            raise InputError(
+                f"{shot.file(reference, number)}: expected a reference in the data window of the color, found another; "
+                "render it so, or leave it out with --map reference="
+            )
 
 
 def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main: Part) -> None:
@@ -189,10 +205,10 @@ def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main
                 "render all frames with the same layers"
             )
         part = header.parts[layer.part]
-        if (part.size, part.origin) != (main.size, main.origin):
+        if part.window != main.window and part.display != main.display:
             raise InputError(
-                f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; "
-                "render all buffers and frames at one size"
+                f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
+                "buffers and frames at one size, or crop them in one display window"
             )
 
 
@@ -402,9 +418,9 @@ def _seen_elsewhere(
 def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
     """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
     color, number = shot.choice.layers["color"], shot.numbers[0]
-    height, width = shot.size
     main = shot.part(color)
-    same = [each for each in layers if (shot.part(each).size, shot.part(each).origin) == (main.size, main.origin)]
+    height, width = main.size
+    same = [each for each in layers if shot.part(each).window == main.window]
     wanted = list(dict.fromkeys(layer for layer in same if number in shot.groups[layer.group].files))
     found: dict[Layer, list[Image]] = {layer: [] for layer in wanted}
     for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int):
@@ -506,7 +522,7 @@ def _look_at_samples(shot: RenderedFiles, samples: SampleLayers) -> None:
 
 def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
     """Whether all frames have these layers, with the data window of the color."""
-    main = shot.part(shot.choice.layers["color"])
+    color = shot.choice.layers["color"]
     for layer in set(layers):
         files = shot.groups[layer.group].files
         for number in shot.numbers:
@@ -514,7 +530,7 @@ def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
             own = parts[layer.part] if layer.part < len(parts) else None
             if own is None or not {*layer.channels} <= {*own.channels}:
                 return False
-            if (own.size, own.origin) != (main.size, main.origin):
+            if own.window != read_image_header(shot.file(color, number)).parts[color.part].window:
                 return False
     return True
 
