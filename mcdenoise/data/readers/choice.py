@@ -11,7 +11,7 @@ import numpy as np
 
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.cameras import fit_camera
-from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, named, recognise, usual
+from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, is_luminance, named, recognise, usual
 from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
@@ -69,7 +69,8 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     strangers: list[Layer] = []
     for layer in layers:
         found = recognise(layer)
-        if found is not None and fits(found[0], layer):
+        # A single channel is a color only if there is no other.
+        if found is not None and fits(found[0], layer) and not (found[0] == "color" and len(layer.channels) == 1):
             candidates[found[0]].append((found[1], layer))
         else:
             strangers.append(layer)
@@ -127,7 +128,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _is_letter(layer: Layer) -> bool:
-    return layer.anonymous and layer.is_color and _WORDS.search(layer.name) is None
+    return layer.anonymous and (layer.is_color or len(layer.channels) == 1) and _WORDS.search(layer.name) is None
 
 
 def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Layer:
@@ -152,8 +153,10 @@ def _color(
     if not candidates:
         # A single picture of unknown name is the noisy color.
         pictures = [layer for layer in strangers if layer.is_color]
-        if len(pictures) == 1:
-            return pictures[0]
+        single = [layer for layer in strangers if len(layer.channels) == 1]
+        for own in (pictures, [layer for layer in single if is_luminance(layer)], single):
+            if len(own) == 1 and (own is pictures or not pictures):
+                return own[0]
         found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *layers][:12])) or "no layers of floats"
         raise InputError(
             f"{where}: expected noisy radiance, found {found}; give its file too, or name it with --map color=LAYER"

@@ -19,7 +19,7 @@ from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_channels, rea
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import Split
-from mcdenoise.data.readers.layers import Layer
+from mcdenoise.data.readers.layers import GREY, Layer
 from mcdenoise.data.readers.lights import Light, is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
@@ -218,10 +218,13 @@ class RenderedFiles:
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         inside: dict[tuple[int, str], Image] = {}
         if output_layer is not None:
-            names = [".".join((*layer.family, output_layer, letter)) for letter in "RGB"]
-            inside = {(layer.part, name): image[..., i] for i, name in enumerate(names)}
+            grey = len(layer.channels) == 1
+            names = [".".join((*layer.family, output_layer, letter)) for letter in ("Y" if grey else "RGB")]
+            planes = image.mean(-1, keepdims=True) if grey else image
+            inside = {(layer.part, name): planes[..., i] for i, name in enumerate(names)}
         for each in self.choice.written if output_layer is None else ():
-            files[each.group] |= {(each.part, name): image[..., i] for i, name in enumerate(each.channels[:3])}
+            planes = image.mean(-1, keepdims=True) if len(each.channels) == 1 else image
+            files[each.group] |= {(each.part, name): planes[..., i] for i, name in enumerate(each.channels[:3])}
         if alpha is not None:
             own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]
             files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
@@ -236,6 +239,7 @@ class RenderedFiles:
                 part=layer.part,
                 like=layer.channels[0],
                 full_float=full_float,
+                stored=self.parts[group][0],
             )
         return out / self.file(layer, number).name
 
@@ -371,8 +375,10 @@ class RenderedFiles:
             )
         # Layers of light are not buffers.
         if self.part(layer).display_referred and (name in _LIGHT or name not in BUFFERS):
-            pixels = np.concatenate([decode(pixels[..., :3]), pixels[..., 3:]], -1)
+            pixels = np.concatenate([decode(pixels[..., :3], self.part(layer).gamma), pixels[..., 3:]], -1)
         channels = BUFFERS[name].channels if name in BUFFERS else 3
+        if name in GREY and pixels.shape[2] == 1:
+            return np.repeat(pixels, 3, -1)
         if name in ("color", "motion"):
             return pixels
         if name == "variance" and pixels.shape[2] < 3:

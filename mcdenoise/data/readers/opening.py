@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -45,6 +46,8 @@ from mcdenoise.data.readers.values import (
 from mcdenoise.errors import InputError
 from mcdenoise.noise import noise_is_spread
 
+# Color spaces of images that the user may state.
+ColorSpace: TypeAlias = Literal["auto", "linear", "srgb"]
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
 # Strips of rows, and the columns in them, in which layers are compared with the color.
@@ -65,6 +68,7 @@ def open_files(
     mapping: Mapping[str, str],
     color_has_albedo: bool | None = None,
     lights: Sequence[str] = (),
+    color_space: ColorSpace = "auto",
 ) -> RenderedFiles:
     """Open the files of a shot: determine their contents by names, headers, and values of the first frames.
 
@@ -75,6 +79,7 @@ def open_files(
         mapping: see :func:`mcdenoise.data.readers.choice.choose`.
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
         lights: names of additive layers of radiance that are denoised with the color.
+        color_space: that of images other than EXR; by default what the files say.
 
     Raises:
         InputError: the files cannot be recognised, do not match one another, or cannot be read.
@@ -95,7 +100,9 @@ def open_files(
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
-    shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {}, warnings=choice.warnings)
+    shot = RenderedFiles(
+        groups, [_parts(header, color_space) for header in headers], numbers, choice, {}, warnings=choice.warnings
+    )
     _check(shot)
     found, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
     folder = shot.file(color, numbers[0]).parent
@@ -110,6 +117,13 @@ def open_files(
     if not _FEATURES & {*choice.layers, *mapping}:
         _look_beside(shot)
     return shot
+
+
+def _parts(header: ImageHeader, color_space: ColorSpace) -> tuple[Part, ...]:
+    """The parts of a file, in another color space if that is stated."""
+    if header.format == "openexr" or color_space == "auto":
+        return header.parts
+    return tuple(replace(part, display_referred=color_space == "srgb", gamma=0.0) for part in header.parts)
 
 
 @dataclass(frozen=True)
@@ -127,12 +141,13 @@ class Result:
     size: tuple[int, int]
 
     def read(self) -> tuple[Tensor, Metadata]:
-        """Read ``(1, 3, H, W)`` radiance, and the attributes of the file.
+        """Read ``(1, 3, H, W)`` radiance, thrice the same from one channel, and the attributes of the file.
 
         Raises:
             InputError: the file is damaged.
         """
         pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
+        pixels = np.repeat(pixels, 3, -1) if pixels.shape[2] == 1 else pixels
         image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
         return image, read_image_header(self.path).metadata
 
@@ -286,7 +301,8 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     if shot.part(shot.choice.layers["color"]).display_referred:
         words.append("display values, made linear")
         shot.warnings.append(
-            "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats"
+            "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats, or say "
+            "--input-color-space linear if its numbers are linear"
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
     color = np.nan_to_num(images["color"][..., :3])
@@ -431,7 +447,9 @@ def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Im
             pixels = read_channels(shot.file(own[0], number), {key[1]: channels}, rows)[key[1]]
             for place, layer in enumerate(own):
                 image = pixels[:, :: max(1, width // _COLUMNS), 3 * place : 3 * place + 3].reshape(-1, 3)
-                found[layer].append(decode(image[None])[0] if shot.part(layer).display_referred else image)
+                found[layer].append(
+                    decode(image, shot.part(layer).gamma) if shot.part(layer).display_referred else image
+                )
     return {layer: np.concatenate(strips) for layer, strips in found.items() if strips}
 
 
