@@ -153,7 +153,7 @@ def _color(
     if not candidates:
         # A single picture of unknown name is the noisy color.
         pictures = [layer for layer in strangers if layer.is_color]
-        single = [layer for layer in strangers if layer.components == ("",) or is_luminance(layer)]
+        single = [layer for layer in strangers if layer.components in (("",), ("v",)) or is_luminance(layer)]
         for own in (pictures, [layer for layer in single if is_luminance(layer)], single):
             if len(own) == 1 and (own is pictures or not pictures):
                 return own[0]

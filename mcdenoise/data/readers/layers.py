@@ -169,7 +169,7 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
 def is_luminance(layer: Layer) -> bool:
     """Whether a layer is a single channel with the name of a luminance, or of a color."""
     says = recognise(layer)
-    named_so = layer.title.lower() in _LUMINANCE or set(layer.components) <= _LUMINANCE
+    named_so = bool({layer.title.lower(), *layer.components} & _LUMINANCE)
     return len(layer.channels) == 1 and (named_so or (says is not None and says[0] == "color"))
 
 
