@@ -223,7 +223,11 @@ class RenderedFiles:
             planes = image.mean(-1, keepdims=True) if grey else image
             inside = {(layer.part, name): planes[..., i] for i, name in enumerate(names)}
         for each in self.choice.written if output_layer is None else ():
-            planes = image.mean(-1, keepdims=True) if len(each.channels) == 1 else image
+            matrix = self.choice.converted.get(each)
+            if matrix is not None:
+                planes = (image @ matrix.T).astype(np.float32)
+            else:
+                planes = image.mean(-1, keepdims=True) if len(each.channels) == 1 else image
             files[each.group] |= {(each.part, name): planes[..., i] for i, name in enumerate(each.channels[:3])}
         if alpha is not None:
             own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]

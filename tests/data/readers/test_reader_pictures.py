@@ -156,3 +156,24 @@ def test_both_color_spaces_are_one_too_many(run: Run, tmp_path: Path) -> None:
     status, _, errors = run("denoise", tmp_path / "a.png", *options)
     assert status == 2
     assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("names", ["XYZ", "XYZA", "Y", "YA"])
+def test_the_color_in_another_space_is_written_too(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
+    """Mitsuba's films write XYZ or luminance beside the RGB of the nested integrator: never half of a file."""
+    to_xyz = np.array([[0.412453, 0.35758, 0.180423], [0.212671, 0.71516, 0.072169], [0.019334, 0.119193, 0.950227]])
+    color = np.random.default_rng(0).gamma(1, 1, (*SIZE, 3)).astype(np.float32)
+    light = color @ to_xyz.T
+    channels = {name: light[..., "XYZ".index(name)] for name in names.removesuffix("A")}
+    channels |= {f"image.{each}": color[..., i] for i, each in enumerate("RGB")}
+    channels |= {"A": np.full(SIZE, 0.5)} if names.endswith("A") else {}
+    channels |= {f"other.{each}": light[..., i] * 1.1 for i, each in enumerate("XYZ")}
+    sequence = open_sequence(save(tmp_path / "a.exr", channels))
+    np.testing.assert_allclose(sequence.frame(0).color[0].movedim(0, -1).numpy(), color, rtol=1e-6)
+    (tmp_path / "out").mkdir()
+    path = sequence.write(tmp_path / "out", 0, color * np.float32(0.5))
+    after = oiio.ImageBuf(str(path))
+    pixels = dict(zip(after.spec().channelnames, np.moveaxis(after.get_pixels("float"), -1, 0), strict=True))
+    for name, image in channels.items():
+        expected = image if name == "A" or name.startswith("other") else image * 0.5
+        np.testing.assert_allclose(pixels[name], expected, rtol=1e-5)
