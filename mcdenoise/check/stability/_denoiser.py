@@ -166,7 +166,7 @@ def _gradients(model: str, shots: dict[str, list[Frame]]) -> Iterator[Check]:
     denoiser = parse_method(model).denoiser(differentiable=True)
     for name in _DIFFERENTIATED:
         denoiser.reset()
-        leaves = []
+        leaves: list[Tensor] = []
         try:
             for frame in shots[name]:
                 given = {key: image.clone().requires_grad_() for key, image in frame.items()}
