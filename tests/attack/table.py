@@ -194,6 +194,7 @@ COMMANDS = {
     "reader precision": Command("reader precision precision.json", ("precision.json",), printed),
     "reader clean": Command("reader clean clean", ("clean",), printed),
     "reader halves": Command("reader halves reference0.partial.npz", ("reference0.partial.npz",), printed),
+    "reader take": Command("reader take 0.take.npz", ("0.take.npz",), printed),
 }
 
 
@@ -275,6 +276,13 @@ def read_halves(path: Path) -> object:
     return [halves.mean(), halves.noise(), halves.spp]
 
 
+def read_take(path: Path) -> object:
+    from mcdenoise.data.shards import open_shard
+
+    shard = open_shard(path)
+    return dict(shard.header), {name: array.tobytes() for name, array in shard.read().items()}
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "exr": read_exr,
     "sequence": read_sequence,
@@ -289,6 +297,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "precision": read_precision,
     "clean": read_clean,
     "halves": read_halves,
+    "take": read_take,
 }
 
 
@@ -428,6 +437,7 @@ KINDS = {
     "precision.json": Kind("precision.json", json.loads, {"reader precision": 120}),
     "run_times.json": Kind("run_times.json", json.loads, {"reader run_times": 120}),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, {"reader clean": 100}),
+    "packed take": Kind("0.take.npz", entries, {"reader take": 160}),
     "unfinished reference": Kind("reference0.partial.npz", exactly, {"reader halves": 120}),
 }
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
 from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_clean_features
+from mcdenoise.data.shards import write_shard
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
@@ -103,6 +104,8 @@ def build(folder: Path) -> None:
     halves = ReferenceHalves.start(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
     halves.add(np.full((WIDTH * HEIGHT, 3), 1.5), 4)
     halves.save(folder / "reference0.partial.npz")
+    colors = np.stack([frame.color[0].numpy() for frame in frames])
+    write_shard(folder / "0.take.npz", {"number": 0, "credits": []}, {"color": colors, "reference": colors[-1:]})
     stop_a_training(folder)
 
 
