@@ -47,14 +47,14 @@ ALLOWED: dict[str, set[str]] = {
     "ops": set(),
     "light": {"errors", "ops"},
     "frame": {"errors", "light", "ops"},
-    "noise": {"frame", "ops"},
+    "noise": {"ops"},
     "sampling": {"frame"},
     "metrics": SIGNAL,
     "nn": SIGNAL,
     "models": SIGNAL | {"nn", "own", "user_cache"},
     # Leaves: what is read and rendered knows the frame, and no method.
     "data": SIGNAL | {"interruption"},
-    "scenes": SIGNAL | {"data", "engines", "interruption"},
+    "scenes": SIGNAL | {"data", "engines", "interruption", "user_cache"},
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     # These modules are for scripts of a renderer: nothing of the package imports them.

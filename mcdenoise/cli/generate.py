@@ -12,26 +12,31 @@ from typing import Literal
 
 import tyro
 
-from mcdenoise.cli._options import Flag, Out
-from mcdenoise.cli._output import print_rows, progress_bar, say
+from mcdenoise.cli._options import Flag, Out, parse_size
+from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine, Task, run_tasks
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.assets import default_folder, open_assets
 from mcdenoise.scenes.cycles import Blender
 from mcdenoise.scenes.generation import Generation, render_seed
 from mcdenoise.scenes.random.takes import Sampling
 from mcdenoise.scenes.render import choose_variant
+from mcdenoise.scenes.takes import TakePlan, render_takes
+from mcdenoise.scenes.takes.draw import FRAMES
+from mcdenoise.scenes.takes.tracing import HALF
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _WILD_STILLS = 0.5
+_FRAMES = 12
 
 
 def generate(
     out: Out,
     rendering: tyro.conf.OmitArgPrefixes[RenderOptions] = _FOR_TRAINING,
     seeds: str = "0-15",
-    frames: int = 12,
+    frames: int = _FRAMES,
     zoom: float = 1.0,
     noise_seed: int | None = None,
     wild: bool = False,
@@ -42,6 +47,9 @@ def generate(
     blender_python: Path | None = None,
     parts: Flag = False,
     threads: int = 0,
+    takes: Flag = False,
+    assets: Path | None = None,
+    unseen: Flag = False,
 ) -> int | None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
@@ -53,7 +61,7 @@ def generate(
         out: folder of the sequences; finished frames in it are kept.
         rendering: samples, references, size and processors.
         seeds: seeds of the scenes, such as 0-99,200.
-        frames: frames of each sequence.
+        frames: frames of each sequence; with --takes 16 by default.
         zoom: render the middle of an image that is so many times as wide and high.
         noise_seed: seed of the noise of all scenes; by default each scene takes its own seed.
         wild: frames as renderers' users have them: coats, mirrors, glass and metal in every scene, --sampling mixed,
@@ -69,9 +77,21 @@ def generate(
         blender_python: a Python that has Blender's module bpy; by default that of the environment variable
             BLENDER_PYTHON, or else this one.
         parts: with Cycles, also write diffuse and specular light, which add up to each noisy color.
-        threads: threads of Cycles; all processors by default. With --ray, the processors that a task takes; 1 by
-            default.
+        threads: threads of Cycles and of --takes; all processors by default. With --ray, the processors that a task
+            takes; 1 by default.
+        takes: packed takes instead of sequences, OUT/000000.take.npz, ..., of furnished rooms, desks, streets, pools
+            and things before nothing. --seeds are their numbers. A third are stills, the others have 16 frames with
+            references on the last three. Pixel filter, lens, features and samples are drawn, too. The only other
+            options that count are --frames, --size, --reference-spp (from 2 on), --variant and --threads.
+        assets: folder of the models, skies and normal maps of --takes, which are fetched to it; by default in the
+            user's cache.
+        unseen: make takes of the tenth of the assets that no other take has, to measure on.
     """
+    if takes:
+        _make_takes(out, rendering, seeds, frames, threads, assets or default_folder(), unseen)
+        return None
+    if unseen or assets is not None:
+        raise InputError("--assets, --unseen: expected together with --takes, found alone")
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
     if not 0 < zoom < math.inf:
@@ -121,6 +141,34 @@ def generate(
                 say(written)
             progress.advance(scenes)
     return None
+
+
+def _make_takes(
+    out: Path, rendering: RenderOptions, seeds: str, frames: int, threads: int, assets: Path, unseen: bool
+) -> None:
+    """Render packed takes; options that have the defaults of sequences have those of takes."""
+    given = {name: value for name, value in vars(rendering).items() if value != getattr(_FOR_TRAINING, name)}
+    others = given.keys() - {"size", "reference_spp", "variant"}
+    if others:
+        raise InputError(f"--{min(others).replace('_', '-')}: expected none beside --takes, which draws it, found one")
+    if rendering.reference_spp < 2 or frames < 1:
+        raise InputError("--reference-spp, --frames: expected at least 2 samples and 1 frame for --takes")
+    numbers = parse_frames(seeds, name="--seeds")
+    plan = TakePlan(
+        out=out,
+        assets=open_assets(assets, lambda line: warn([line])),
+        unseen=unseen,
+        variant=choose_variant(rendering.variant),
+        threads=threads,
+        frames=FRAMES if frames == _FRAMES else frames,
+        size=parse_size(rendering.size) if "size" in given else None,
+        half=rendering.reference_spp // 2 if "reference_spp" in given else HALF,
+    )
+    with progress_bar() as progress:
+        task = progress.add_task("takes", total=len(numbers))
+        for written in render_takes(plan, numbers):
+            say(written)
+            progress.advance(task)
 
 
 def _on_ray(plan: Generation, seeds: list[int], address: str, out: Path) -> int | None:

@@ -70,14 +70,14 @@ def random_scene(seed: int, frames: int = 8, zoom: float = 1.0, *, shiny: bool =
     if shiny:
         shine(builder, shine_rng)
     cameras = shoot(builder, camera_rng, frames)
-    moves = _movements(builder, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_FRACTION else {}
+    moves = movements(builder, move_rng, frames, cameras[0]) if move_rng.random() < _MOVING_FRACTION else {}
     if zoom != 1:
-        cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
+        cameras = [replace(camera, fov_x=narrowed(camera.fov_x, zoom)) for camera in cameras]
     scene = _exposed(builder.scene(), 10 ** float(level_rng.uniform(-1.5, 1.5)))
-    return RandomScene(scene, cameras, moves, _distance(builder, cameras[0]))
+    return RandomScene(scene, cameras, moves, distance(builder, cameras[0]))
 
 
-def _distance(builder: SceneBuilder, camera: Camera) -> float:
+def distance(builder: SceneBuilder, camera: Camera) -> float:
     """Distance along the viewing axis to the point of interest that a camera looks at."""
     origin, forward = camera.to_world[:3, 3], camera.to_world[:3, 2]
     ways = np.array([point - origin for point in builder.points]).reshape(-1, 3)
@@ -88,11 +88,11 @@ def _distance(builder: SceneBuilder, camera: Camera) -> float:
     return float(depth[np.argmax(depth / np.linalg.norm(ways, axis=1))])
 
 
-def _narrowed(fov: float, zoom: float) -> float:
+def narrowed(fov: float, zoom: float) -> float:
     return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) / zoom))
 
 
-def _movements(builder: SceneBuilder, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
+def movements(builder: SceneBuilder, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
     """Let one to three small objects slide, swing or rotate, or let a lamp swing."""
     moves: dict[str, Array] = {}
     bulbs = [name for name in builder.lamps if _is_small(builder, [name])]

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
+from mcdenoise.scenes.assets import Mesh
 from mcdenoise.scenes.random.materials import Bsdf, every_kind
 from mcdenoise.scenes.random.textures import Color
 
@@ -25,6 +26,7 @@ _BOUNDS = {
     "cylinder": ((-1, -1, 0), (1, 1, 1)),
     "disk": ((-1, -1, 0), (1, 1, 0)),
     "rectangle": ((-1, -1, 0), (1, 1, 0)),
+    "mesh": ((-1, -1, -1), (1, 1, 1)),
 }
 
 
@@ -37,12 +39,14 @@ class Part:
         to_group: ``(4, 4)`` transform from the shape's own space.
         material: result of :meth:`SceneBuilder.material`.
         radiance: emitted radiance, if it is a light.
+        mesh: triangles of a part of the kind ``"mesh"``.
     """
 
     kind: str
     to_group: Array
     material: dict[str, str]
     radiance: Color | None = None
+    mesh: Mesh | None = None
 
 
 class SceneBuilder:
@@ -88,6 +92,8 @@ class SceneBuilder:
             matrix = part.to_group if to_world is None else to_world @ part.to_group
             name = f"{'lamp' if part.radiance else part.kind}_{len(self._objects)}"
             shape: dict[str, Any] = {"type": part.kind, "to_world": matrix, "bsdf": part.material}
+            if part.mesh is not None:
+                shape["mesh"] = part.mesh
             if part.radiance is not None:
                 shape["emitter"] = {"type": "area", "radiance": rgb(part.radiance), "sampling_weight": 1.0}
                 self.lamps.append(name)
@@ -116,8 +122,13 @@ class SceneBuilder:
         return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
 
     def scene(self) -> dict[str, Any]:
-        """The Mitsuba dictionary."""
-        return {"type": "scene", **self._materials, **self._objects, **self._lights, **self._rest()}
+        """The Mitsuba dictionary, filled up for a vectorised renderer."""
+        return {**self.plain_scene(), **self._rest()}
+
+    def plain_scene(self) -> dict[str, Any]:
+        """The Mitsuba dictionary of what is there; a shape of the type ``"mesh"`` holds its triangles."""
+        sky = {} if self._sky is None else {"sky": self._sky}
+        return {"type": "scene", **self._materials, **self._objects, **self._lights, **sky}
 
     def _rest(self) -> dict[str, Any]:
         """Tiny hidden shapes of every type and lights that do not emit, so that all scenes use the same plugins."""
@@ -127,7 +138,7 @@ class SceneBuilder:
         for number, bsdf in enumerate(every_kind()):
             material = f"spare_material_{number}"
             rest[material] = bsdf
-            for kind in _BOUNDS:
+            for kind in ("cube", "sphere", "cylinder", "disk", "rectangle"):
                 matrix = place((x + 0.01 * number, below, z), scale=(0.001, 0.001, 0.001))
                 rest[f"spare_{kind}_{number}"] = {
                     "type": kind,

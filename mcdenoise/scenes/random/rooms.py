@@ -33,26 +33,26 @@ def build(rng: Rng) -> SceneBuilder:
     kinds: list[Callable[[Rng], SceneBuilder]] = [
         _daylight_room,
         _lamp_room,
-        _still_life,
-        _colonnade,
-        _light_experiment,
+        still_life,
+        colonnade,
+        light_experiment,
     ]
     return kinds[int(rng.choice(len(kinds), p=[0.32, 0.26, 0.2, 0.14, 0.08]))](rng)
 
 
 def _daylight_room(rng: Rng) -> SceneBuilder:
     """A room lit through its windows by the sky and often the sun."""
-    builder, size = _empty_room(rng)
+    builder, size = empty_room(rng)
     lit_walls = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.6, 0.3, 0.1]))]
     opening = 0.0
     for wall in range(4):
         if wall in lit_walls:
-            opening += _wall_with_windows(builder, rng, size, wall)
+            opening += wall_with_windows(builder, rng, size, wall)
         else:
-            _closed_wall(builder, rng, size, wall)
+            closed_wall(builder, rng, size, wall)
     surface = 2 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
     level = float(np.clip(0.25 * surface / max(opening, 0.1), 1.5, 40)) * float(np.exp(rng.uniform(-0.7, 0.7)))
-    sun = sun_direction(rng, _outwards(int(lit_walls[0]))) if rng.random() < 0.65 else None
+    sun = sun_direction(rng, outwards(int(lit_walls[0]))) if rng.random() < 0.65 else None
     builder.set_sky(sky(rng, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     if rng.random() < 0.25:
         add_lamps(builder, rng, builder.low, builder.high, int(rng.integers(1, 3)), 0.1)
@@ -62,13 +62,13 @@ def _daylight_room(rng: Rng) -> SceneBuilder:
 
 def _lamp_room(rng: Rng) -> SceneBuilder:
     """A room with lamps, and sometimes a window with a night or dusk sky."""
-    builder, size = _empty_room(rng)
+    builder, size = empty_room(rng)
     window = int(rng.integers(4)) if rng.random() < 0.3 else -1
     for wall in range(4):
         if wall == window:
-            _wall_with_windows(builder, rng, size, wall)
+            wall_with_windows(builder, rng, size, wall)
         else:
-            _closed_wall(builder, rng, size, wall)
+            closed_wall(builder, rng, size, wall)
     if window >= 0:
         builder.set_sky(sky(rng, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
     add_lamps(builder, rng, builder.low, builder.high, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
@@ -76,7 +76,7 @@ def _lamp_room(rng: Rng) -> SceneBuilder:
     return builder
 
 
-def _still_life(rng: Rng) -> SceneBuilder:
+def still_life(rng: Rng) -> SceneBuilder:
     """Ornaments on a table or on the ground, under the sky or in a studio."""
     builder = SceneBuilder((-1.9, 0.05, -1.9), (1.9, 1.5, 1.9))
     repeat = float(rng.integers(6, 25))
@@ -110,7 +110,7 @@ def _still_life(rng: Rng) -> SceneBuilder:
     return builder
 
 
-def _colonnade(rng: Rng) -> SceneBuilder:
+def colonnade(rng: Rng) -> SceneBuilder:
     """A courtyard under the sky with columns, surrounded by galleries that receive little light from the sky."""
     width, depth, height = rng.uniform(4, 9), rng.uniform(6, 14), rng.uniform(2.6, 4.2)
     aisle, floors = rng.uniform(1.5, 3), int(rng.integers(1, 3))
@@ -154,7 +154,7 @@ def _colonnade(rng: Rng) -> SceneBuilder:
     return builder
 
 
-def _light_experiment(rng: Rng) -> SceneBuilder:
+def light_experiment(rng: Rng) -> SceneBuilder:
     """Glossy plates that reflect emitting balls of very different sizes."""
     builder = SceneBuilder((-2.4, 0.3, -1.2), (2.4, 2.6, 4))
     builder.add([box((0, -0.1, 1), (8, 0.2, 8), builder.material(random_opaque(rng, (3, 3))))])
@@ -184,7 +184,7 @@ def _light_experiment(rng: Rng) -> SceneBuilder:
     return builder
 
 
-def _empty_room(rng: Rng) -> tuple[SceneBuilder, Array]:
+def empty_room(rng: Rng) -> tuple[SceneBuilder, Array]:
     """Floor, ceiling, beams and pillars; the walls are added later."""
     large = rng.random() < 0.25
     size = rng.uniform((2.4, 2.3, 3.0), (5.5, 3.2, 6.5)) * ((1.6, 1.4, 1.6) if large else (1, 1, 1))
@@ -217,12 +217,13 @@ def _wall_frame(size: Array, wall: int) -> tuple[Array, float]:
     return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth)
 
 
-def _outwards(wall: int) -> float:
+def outwards(wall: int) -> float:
     """Azimuth of a wall's outward direction, degrees from +z towards +x."""
     return (180.0, -90.0, 0.0, 90.0)[wall]
 
 
-def _closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None:
+def closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None:
+    """A wall without windows, with pictures, and at times a door."""
     frame, length = _wall_frame(size, wall)
     height = float(size[1])
     look = texture(rng) if rng.random() < 0.35 else wall_color(rng)
@@ -243,8 +244,8 @@ def _closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> Non
         builder.points.append((frame @ where)[:3, 3])
 
 
-def _wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> float:
-    """A wall with a row of windows, with bars, blinds or curtains; returns the area of the windows."""
+def wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float = 0.5) -> float:
+    """A wall with a row of windows, with bars, and a fraction with blinds or curtains; returns the windows' area."""
     frame, length = _wall_frame(size, wall)
     height = float(size[1])
     count = int(rng.integers(1, 4)) if length > 3 else 1
@@ -267,7 +268,7 @@ def _wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int) 
         )
     columns, rows = (int(n) for n in rng.integers(0, 4, 2))
     glazed = rng.random() < 0.12
-    dressing = rng.choice(["none", "blinds", "curtains"], p=[0.5, 0.2, 0.3])
+    dressing = rng.choice(["none", "blinds", "curtains"], p=[1 - dressed, 0.4 * dressed, 0.6 * dressed])
     for x in middles:
         tall = top - sill
         for n in range(columns):

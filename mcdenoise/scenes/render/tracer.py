@@ -62,6 +62,7 @@ class Tracer:
         variant: one of ``VARIANTS``.
         max_depth: longest path, in segments.
         moves: see :class:`mcdenoise.data.camera_path.CameraPath`.
+        merge: whether meshes that do not move may become one.
 
     ``mitsuba`` is its module, ``scene`` and ``path`` are its scene and integrator, ``moving`` the moving shapes by id,
     and ``movers`` the list of these ids.
@@ -71,7 +72,15 @@ class Tracer:
             does not exist.
     """
 
-    def __init__(self, scene: Scene, variant: str, max_depth: int, moves: Mapping[str, Array] | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        variant: str,
+        max_depth: int,
+        moves: Mapping[str, Array] | None = None,
+        *,
+        merge: bool = True,
+    ) -> None:
         self.mitsuba = mi = _import_mitsuba()
         try:
             mi.set_variant(variant)
@@ -84,7 +93,7 @@ class Tracer:
         self._scalar = variant.startswith("scalar")
         self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
         # Merged meshes could not move separately.
-        self.scene = _load_scene(mi, scene, merge=not moves)
+        self.scene = _load_scene(mi, scene, merge=merge and not moves)
         self.path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
         self._independent = mi.load_dict({"type": "independent"})
         self._stratified = mi.load_dict({"type": "multijitter", "sample_count": STRATIFIED_PATHS})

@@ -1,0 +1,171 @@
+"""Takes to train on: short shots and stills of random places, each a packed file that its number determines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array
+from mcdenoise.data.files import write_text
+from mcdenoise.data.shards import ERROR, SUFFIX, write_shard
+from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
+from mcdenoise.scenes.assets import Assets
+from mcdenoise.scenes.takes.draw import FRAMES, REFERENCES, draw_take
+from mcdenoise.scenes.takes.tracing import HALF, TakeTracer
+
+__all__ = ["TakePlan", "render_takes"]
+
+_ATTEMPTS = 6
+# Largest SMAPE between two means of eight samples: with more, the references are noise, too.
+_NOISIEST = 0.6
+_MIDDLE = 0.2
+_BLOCK = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakePlan:
+    """How takes are rendered.
+
+    Args:
+        out: folder of the files.
+        assets: what scenes are made of.
+        unseen: whether only from the tenth of the assets that is never trained on.
+        variant: of Mitsuba.
+        threads: 0 for all processors.
+        frames: of a take that is no still.
+        size: width and height in pixels; by default those of training.
+        half: samples a pixel of each half of a reference.
+    """
+
+    out: Path
+    assets: Assets
+    unseen: bool
+    variant: str
+    threads: int = 0
+    frames: int = FRAMES
+    size: tuple[int, int] | None = None
+    half: int = HALF
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What all takes of a folder have in common."""
+        size = list(self.size) if self.size else None
+        own = {"unseen": self.unseen, "assets": self.assets.digest, "frames": self.frames, "size": size}
+        return {"takes": 1, **own, "reference_spp": 2 * self.half}
+
+
+def render_takes(plan: TakePlan, numbers: Sequence[int]) -> Iterator[Path]:
+    """Render the takes of these numbers that are not there yet, one after the other.
+
+    Args:
+        plan: how.
+        numbers: of the takes.
+
+    Yields:
+        The file of each take.
+
+    Raises:
+        InputError: Mitsuba is missing, or the folder cannot be written or holds takes of another plan.
+    """
+    _claim(plan)
+    for number in numbers:
+        path = plan.out / f"{number:06d}{SUFFIX}"
+        if not path.exists():
+            _render(plan, number, path)
+        yield path
+
+
+def _claim(plan: TakePlan) -> None:
+    """Write what the folder holds, or compare it with what is there."""
+    about = plan.out / "takes.json"
+    try:
+        plan.out.mkdir(parents=True, exist_ok=True)
+        found = json.loads(read_text(about)) if about.exists() else plan.identity
+    except (OSError, ValueError) as error:
+        raise InputError(f"{plan.out}: expected a folder to write takes to, found {error}") from error
+    for key, value in plan.identity.items():
+        if found.get(key) != value:
+            raise InputError(
+                f"{plan.out}: expected takes with {key} {value}, found {found.get(key)}; choose another folder"
+            )
+    write_text(about, json.dumps(plan.identity, indent=1) + "\n")
+
+
+def _render(plan: TakePlan, number: int, path: Path) -> None:
+    assets = plan.assets.part(plan.unseen)
+    for attempt in range(_ATTEMPTS):
+        take = draw_take(number, assets, attempt, frames=plan.frames, size=plan.size)
+        tracer = TakeTracer(take, plan.variant, plan.threads, plan.half)
+        last = len(take.cameras) - 1
+        tracer.place(last)
+        final = tracer.noisy(last)
+        if shows_enough(final, take.void) and tracer.noise(last) < _NOISIEST:
+            break
+    arrays = {name: np.empty((last + 1, *image.shape), np.float32) for name, image in final.items()}
+    references = min(REFERENCES, last + 1)
+    means, errors = [], []
+    for frame in range(last + 1):
+        tracer.place(frame)
+        found = final if frame == last else tracer.noisy(frame)
+        for name, image in found.items():
+            arrays[name][frame] = image
+        if frame > last - references:
+            first, second = tracer.halves(frame)
+            means.append((first + second) / 2)
+            errors.append((first - second) / 2)
+    if last:
+        # What was seen before the first frame is unknown.
+        arrays["motion"][0] = np.inf
+    level = _level(means[-1])
+    light = {"color": arrays["color"], "reference": np.stack(means), ERROR: np.stack(errors)}
+    arrays |= {name: image * level for name, image in light.items()}
+    header = {
+        "number": number,
+        **take.settings,
+        "renderer": tracer.name,
+        "exposure": level,
+        "reference_spp": 2 * plan.half,
+        "assets": plan.assets.digest,
+        "unseen": plan.unseen,
+        "moving": sorted(take.moves),
+        "credits": list(take.credits),
+    }
+    tracer.release()
+    write_shard(path, header, arrays)
+
+
+def shows_enough(frame: dict[str, Array], void: bool) -> bool:
+    """Whether a frame is worth its references: neither black, nor nearly empty, nor one plain surface close by."""
+    hit = frame["alpha"][0] > 0.5
+    if hit.mean() < (0.04 if void else 0.3):
+        return False
+    depth = np.where(np.isfinite(frame["depth"][0]), frame["depth"][0], 1e3)
+    if float((depth < 0.12).mean()) > 0.3:
+        return False
+    light = _blocks(frame["color"]).mean(0)[_blocks(frame["alpha"])[0] > 0.5]
+    if light.size == 0 or not float(np.median(light)) > 0.02 * float(light.mean()) > 0:
+        return False
+    looks = np.concatenate([_blocks(frame["albedo"]), _blocks(frame["normal"])])
+    return bool(void or float(looks.reshape(6, -1).std(1).sum()) > 0.25)
+
+
+def _blocks(image: Array) -> Array:
+    """Means of blocks ``(C, H / 8, W / 8)``; a smaller image is one block."""
+    channels, height, width = image.shape
+    high, wide = min(_BLOCK, height), min(_BLOCK, width)
+    cut = image[:, : height // high * high, : width // wide * wide]
+    return np.asarray(cut.reshape(channels, height // high, high, width // wide, wide).mean((2, 4)))
+
+
+def _level(reference: Array) -> float:
+    """The factor, a power of two, that makes a reference's typical radiance a middle gray."""
+    light = reference.mean(0)
+    lit = light[light > 1e-3 * float(light.mean())]
+    typical = float(np.exp(np.log(lit).mean())) if lit.size else 1.0
+    return float(2.0 ** np.round(np.log2(_MIDDLE / typical)))
