@@ -67,6 +67,16 @@ class CachedShot:
         return len(self.colors[0])
 
     @property
+    def noise_seeds(self) -> int:
+        """Number of noisy colors of a frame."""
+        return len(self.colors)
+
+    @property
+    def references(self) -> int:
+        """Number of the last frames that have a reference: all."""
+        return len(self)
+
+    @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
         height, width = self.colors[0].shape[-2:]

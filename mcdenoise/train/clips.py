@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import NO_ALBEDO, demodulate
-from mcdenoise.train.cache import Array, CachedShot
+from mcdenoise.train.cache import Array
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
@@ -35,7 +35,8 @@ class Clip:
     """Consecutive frames of one shot, with the buffers of :class:`mcdenoise.frame.Frame`.
 
     Args:
-        buffers: ``(B, T, C, H, W)`` by name, and ``view_projection`` ``(B, T, 4, 4)``.
+        buffers: ``(B, T, C, H, W)`` by name, and ``view_projection`` ``(B, T, 4, 4)``. A reference of fewer frames is
+            that of the last ones, and no part of a frame.
     """
 
     buffers: dict[str, Tensor]
@@ -69,9 +70,47 @@ class Clip:
             if buffer.dim() == 5
             else buffer[:, when].flatten(0, 1)
             for name, buffer in self.buffers.items()
+            if buffer.shape[1] == len(self)
         }
         extra = {name: flat.pop(name) for name in list(flat) if name not in _KNOWN}
         return Frame(**flat, extra=extra, hints=Hints(keep_all=True))
+
+
+class Shot(Protocol):
+    """Consecutive frames to cut clips from: :class:`mcdenoise.train.cache.CachedShot`, or a packed take."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+
+    @property
+    def noise_seeds(self) -> int:
+        """Number of noisy colors of a frame."""
+
+    @property
+    def references(self) -> int:
+        """Number of the last frames that have a reference."""
+
+    @property
+    def demodulated(self) -> bool:
+        """Whether the radiance of the color is demodulated."""
+
+    def __len__(self) -> int: ...
+
+    def cut(self, frames: slice) -> Shot:
+        """Select consecutive frames."""
+
+    def read(
+        self,
+        frames: slice = slice(None),
+        rows: slice = slice(None),
+        columns: slice = slice(None),
+        *,
+        noise_seed: int = 0,
+        channels: Mapping[str, list[int]] = {},
+        turn: Callable[[Array], Array] = lambda image: image,
+    ) -> dict[str, Tensor]:
+        """Copy a part: ``(T, C, H, W)`` float32 by name; the reference only of frames that have one."""
 
 
 class ClipSampler:
@@ -90,8 +129,10 @@ class ClipSampler:
     factor. Networks normalize the exposure, so this changes only the loss, whose epsilon is in units of radiance.
     Changing an albedo would change the light between surfaces, so albedos are not augmented.
 
+    Where only the last frames of a shot have references, a clip ends with the shot, and its reference has fewer frames.
+
     Args:
-        shots: shots shorter than ``frames`` are skipped.
+        shots: shots shorter than ``frames`` are skipped. All have references on as many of their last ``frames``.
         frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
         lamps: probability that a clip gets rectangles of constant radiance without noise, up to 30 times as bright as
@@ -114,7 +155,7 @@ class ClipSampler:
 
     def __init__(
         self,
-        shots: Iterable[CachedShot],
+        shots: Iterable[Shot],
         frames: int,
         crop: int,
         *,
@@ -151,7 +192,8 @@ class ClipSampler:
     def _draw_one(self) -> dict[str, Tensor]:
         shot = self.shots[int(torch.multinomial(self.chances, 1))]
         height, width = shot.size
-        noise_seed, start = _randint(len(shot.colors)), _randint(len(shot) - self.frames + 1)
+        first = 0 if shot.references == len(shot) else len(shot) - self.frames
+        noise_seed, start = _randint(shot.noise_seeds), first + _randint(len(shot) - self.frames + 1 - first)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = self._draw_turn()
@@ -278,7 +320,8 @@ def _cropped(view: Tensor, size: tuple[int, int], corner: tuple[int, int], crop:
 def _light(clip: dict[str, Tensor], factor: Tensor) -> None:
     """Scale all light of a clip."""
     for name in LIGHT & clip.keys():
-        clip[name] *= factor
+        # The reference may have only the last frames.
+        clip[name] *= factor if factor.dim() == 3 else factor[-len(clip[name]) :]
     if "variance" in clip:
         clip["variance"] *= factor.square()
 

@@ -160,8 +160,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         if settings[name] not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")
     for name in ("exposure", "tint"):
-        if not 0 <= settings[name] <= 10:
-            raise InputError(f"{name}: expected 0 to 10 stops, found {settings[name]}")
+        if not 0 <= settings[name] <= 14:
+            raise InputError(f"{name}: expected 0 to 14 stops, found {settings[name]}")
     if not 0 <= config.seed < 2**32:
         raise InputError(f"seed: expected 0 to 2^32 - 1, found {config.seed}")
     if not config.learning_rate > 0:

@@ -9,13 +9,15 @@ from typing import Any
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.sequences import Sequence
+from mcdenoise.data.shards import Shard, find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
 from mcdenoise.sampling import has_exact_features
-from mcdenoise.train.cache import CachedShot, features_of, open_cached
-from mcdenoise.train.clips import ClipSampler, check_sizes
+from mcdenoise.train.cache import features_of, open_cached
+from mcdenoise.train.clips import ClipSampler, Shot, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
+from mcdenoise.train.packed import check_packed, describe_packed, features_of_shard, open_packed, whole
 
 # Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
 _FEATURES = ("albedo", "normal", "depth")
@@ -32,7 +34,7 @@ class TrainingData:
     """
 
     sampler: ClipSampler
-    watched: list[tuple[str, CachedShot]]
+    watched: list[tuple[str, Shot]]
     description: dict[str, Any]
 
 
@@ -46,6 +48,8 @@ class DataFolders:
         features: names of the buffers without noise to train on.
         training: sequences to train on, except for their validation frames.
         validation: sequences that are used for validation only.
+        packed: packed takes to train on.
+        packed_validation: packed takes that are used for validation only.
     """
 
     config: TrainConfig
@@ -53,6 +57,8 @@ class DataFolders:
     features: frozenset[str]
     training: list[Sequence]
     validation: list[Sequence]
+    packed: list[Shard]
+    packed_validation: list[Shard]
 
     @staticmethod
     def open(
@@ -64,7 +70,7 @@ class DataFolders:
             config: configuration of the run.
             front: front of the model.
             needs: needs of the rest of the model.
-            training: folders to train on.
+            training: folders to train on: sequences, or folders of packed takes.
             validation: folders to validate on only.
 
         Raises:
@@ -75,17 +81,20 @@ class DataFolders:
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
-        opened = [[open_sequence(path) for path in paths] for paths in (training, validation)]
+        packed = [open_packed(paths) for paths in (training, validation)]
+        opened = [[open_sequence(path) for path in paths if not find_shards(path)] for paths in (training, validation)]
         if config.exact_features:
             opened = [[sequence for sequence in each if _is_exact(sequence)] for each in opened]
-            if not opened[0]:
+            packed = [[shard for shard in each if shard.header.get("features") == "exact"] for each in packed]
+            if not opened[0] and not packed[0]:
                 raise InputError(
                     "exact_features: expected a sequence with features without noise to train on, found none among "
                     f"{len(training)}; render one with --sampling centre"
                 )
         both = [*opened[0], *opened[1]]
         # Surfaces without albedo are glossy.
-        common = frozenset.intersection(*(features_of(sequence) for sequence in both))
+        takes = [*packed[0], *packed[1]]
+        common = frozenset.intersection(*map(features_of, both), *map(features_of_shard, takes))
         front = front.of((needs.buffers | needs.uses) & common)
         if config.less_noise and (front.demodulates or front.parts.keys() != {"color"}):
             raise InputError(
@@ -98,9 +107,13 @@ class DataFolders:
         wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
         for sequence in both:
             _check_trainable(sequence, wanted)
+        check_packed(takes, wanted)
+        if takes and config.less_noise:
+            raise InputError("less_noise: expected sequences with a reference for every frame, found packed takes")
         features = used & common
-        folders = DataFolders(config, front, features, *opened)
+        folders = DataFolders(config, front, features, opened[0], opened[1], packed[0], packed[1])
         lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
+        lengths += [(len(shard), shard.size) for shard in folders.packed]
         check_sizes(lengths, config.frames, config.crop)
         return folders
 
@@ -111,8 +124,8 @@ class DataFolders:
             InputError: a file is damaged, or the cache cannot be written.
         """
         config = self.config
-        shots: list[CachedShot] = []
-        watched: list[tuple[str, CachedShot]] = []
+        shots: list[Shot] = [whole(shard, self.front, self.features) for shard in self.packed]
+        watched: list[tuple[str, Shot]] = []
         entries: list[dict[str, Any]] = []
         for sequence in self.training:
             held = self._held_out(sequence)
@@ -135,10 +148,15 @@ class DataFolders:
             noise_seeds = len(cached.shots[0].colors)
             entries.append(_describe(sequence, cached.sha256, noise_seeds=noise_seeds, validation=held))
         description: dict[str, Any] = {"sequences": entries}
+        if self.packed:
+            description["packed"] = describe_packed(self.packed)
         for sequence in self.validation:
             cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], noise_seeds=1)
             watched.append((sequence.name, cached.shots[0]))
             description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
+        watched += [(shard.path.name, whole(shard, self.front, self.features)) for shard in self.packed_validation]
+        if self.packed_validation:
+            description["packed_validation"] = describe_packed(self.packed_validation)
         sampler = ClipSampler(
             shots,
             config.frames,

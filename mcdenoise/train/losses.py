@@ -34,7 +34,7 @@ def stage_loss(
 
     Args:
         output: output for a clip: images ``(B, T, 3, H, W)``, scene-linear radiance including albedo.
-        reference: Y, the same shape.
+        reference: Y, the same shape, or that of its last frames only, which are then the clip.
         weights: weight of the result, ``"image"``, and of stages by name; other stages have weight 0.
         loss: a name in :data:`LOSSES`: ``"smape"``, :func:`smape_loss`; ``"l1_display"``, :func:`l1_display_loss`; or
             ``"rae"``, :func:`rae_loss`.
@@ -57,7 +57,8 @@ def stage_loss(
         >>> stage_loss(Output(clip, {"initial": clip}), clip, {"image": 1, "initial": 1}).item()
         0.0
     """
-    images = {RESULT: output.image, **output.stages}
+    count = reference.shape[1]
+    images = {stage: image[:, -count:] for stage, image in ((RESULT, output.image), *output.stages.items())}
     total = reference.new_zeros(())
     for stage, weight in weights.items():
         total = total + weight * LOSSES[loss](images[stage], reference, temporal_weight=temporal_weight)

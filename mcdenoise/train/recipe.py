@@ -3,7 +3,8 @@
 ::
 
     [train]             # fields of TrainConfig; credits = "authors and licences"
-    [[data]]            # options of `mcdenoise generate`; clean_references = true removes noise from references
+    [[data]]            # options of `mcdenoise generate`; clean_references = true removes noise from references;
+                        # folder = "NAME" is where they are rendered to, in the folder of all data
     [[validation]]      # the same options
     [expected]          # smape and tolerance: the error on the validation frames, and by how much a run may exceed it
 
@@ -26,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import write_text
+from mcdenoise.data.shards import find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.methods import check_names_no_code
 from mcdenoise.models import create_model
@@ -37,11 +39,13 @@ from mcdenoise.train.references import clean_references
 _TABLES = ("train", "data", "validation", "expected", "run")
 _BOUND = {"smape": float, "tolerance": float}
 _CLEAN = "clean_references"
+# Keys of a table of data that are no options of `mcdenoise generate`.
+_OWN: dict[str, type] = {_CLEAN: bool, "folder": str}
 # A run's name is also the name of its folder.
 _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "threads")
-# A file names neither a program to run nor a machine to connect to.
-_OF_CALLERS = {"ray", "blender_python"}
+# A file names neither a program to run, nor a machine to connect to, nor a place outside of the data.
+_OF_CALLERS = {"ray", "blender_python", "assets"}
 # Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
 _FIRST_NAMES = {"noise_seeds": "realisations"}
 
@@ -54,15 +58,17 @@ class Rendering:
         where: file and table of the recipe, for messages.
         options: options of the command, with underscores.
         clean: whether remaining noise is removed from the references, see :func:`clean_references`.
+        name: of the folder; empty for one that the options name.
     """
 
     where: str
     options: Mapping[str, Any]
     clean: bool
+    name: str = ""
 
     def folder(self, data: Path) -> Path:
-        """The folder to render to; the same options have the same folder in every recipe."""
-        return data / self.sha256[:16]
+        """The folder to render to; without a name, the same options have the same folder in every recipe."""
+        return data / (self.name or self.sha256[:16])
 
     @property
     def sha256(self) -> str:
@@ -91,7 +97,7 @@ class Rendering:
                 if not finished.exists():
                     generate()
                     write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
-                sequences = sorted(path for path in place.iterdir() if path.is_dir())
+                sequences = find_shards(place) or sorted(path for path in place.iterdir() if path.is_dir())
                 if self.clean:
                     out = place.with_name(f"{place.name}-clean")
                     sequences = [clean_references(sequence, out) for sequence in sequences]
@@ -247,9 +253,13 @@ def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) ->
     made = []
     for number, table in enumerate(tables, start=1):
         where = f"{path}: [[{name}]] {number}"
-        _check_keys(where, table, {*options, _CLEAN} - _OF_CALLERS)
-        clean = _checked(where, {_CLEAN: table.get(_CLEAN, False)}, {_CLEAN: bool})[_CLEAN]
-        made.append(Rendering(where, {key: value for key, value in table.items() if key != _CLEAN}, clean))
+        _check_keys(where, table, {*options, *_OWN} - _OF_CALLERS)
+        own = _checked(where, {key: table[key] for key in _OWN.keys() & table.keys()}, _OWN)
+        name = own.get("folder", "")
+        if name and not _NAME.fullmatch(name):
+            raise InputError(f"{where}: folder: expected letters, digits, '+', '-' and '_', found '{name}'")
+        rest = {key: value for key, value in table.items() if key not in _OWN}
+        made.append(Rendering(where, rest, own.get(_CLEAN, False), name))
     return made
 
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import Model, State
 from mcdenoise.ops import remodulate
-from mcdenoise.train.cache import CachedShot
-from mcdenoise.train.clips import Clip
+from mcdenoise.train.clips import Clip, Shot
 from mcdenoise.train.losses import RESULT
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 def validate(
     model: Model,
     stages: Iterable[str],
-    watched: list[tuple[str, CachedShot]],
+    watched: list[tuple[str, Shot]],
     fabric: Fabric,
     board: Any,
     step: int,
@@ -53,7 +52,7 @@ def validate(
             images = {RESULT: output.image, **output.stages}
             for stage in stages:
                 for key, score in _scores(stage, images[stage].float(), frame.reference).items():
-                    totals[key] = totals.get(key, 0.0) + score / len(shot) / len(watched)
+                    totals[key] = totals.get(key, 0.0) + score / shot.references / len(watched)
         noisy = frame.color
         if shot.demodulated and frame.albedo is not None:
             noisy = remodulate(noisy, frame.albedo)

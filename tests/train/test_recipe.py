@@ -65,6 +65,14 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
     return path
 
 
+def test_data_may_have_a_folder_of_a_name(tmp_path: Path) -> None:
+    named = Recipe.read(changed(tmp_path, "frames = 3", "frames = 3\nfolder = 'mine'"), options_of("generate")).data[0]
+    other = Recipe.read(TINY, options_of("generate")).data[0]
+    assert named.folder(tmp_path) == tmp_path / "mine"
+    # Where they are does not change what they are.
+    assert named.sha256 == other.sha256
+
+
 def renderings(data: Path) -> dict[Path, int]:
     return {path.relative_to(data): path.stat().st_mtime_ns for path in data.rglob("*.exr")}
 
@@ -123,11 +131,11 @@ def test_another_recipe_does_not_go_on_with_a_run(
     before = renderings(trained / "data")
     recipe = changed(tmp_path, "steps = 12", "steps = 13")
     assert follow(recipe, trained) == 2
-    assert "config.json: expected steps=13 as in this run, found steps=12" in capsys.readouterr().err
+    assert "config.json: expected the same as in this run, found another" in capsys.readouterr().err
     # Other data for the same training.
     recipe = changed(tmp_path, 'seeds = "0-1"', 'seeds = "1"')
     assert follow(recipe, trained, "--data", tmp_path / "data") == 2
-    assert "data.json: expected " in capsys.readouterr().err
+    assert "data.json: expected the same as in this run, found another" in capsys.readouterr().err
     assert renderings(trained / "data") == before
 
 
@@ -177,6 +185,8 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ),
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),
         ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),
+        ("frames = 3", "folder = '../elsewhere'", "[[data]] 1: folder: expected letters, digits, "),
+        ("frames = 3", "assets = 'elsewhere'", "[[data]] 1: unknown key 'assets'; known are "),
         ("frames = 3", "clean_references = 1", "[[data]] 1: clean_references: expected a value of type bool, found 1"),
         ('size = "48x48"\nnoise_seeds = 2', "size = 48", "[[data]] 1: --size: expected WIDTHxHEIGHT"),
         ("tolerance = 0.01", "", "[expected]: expected smape and tolerance, found smape alone"),
