@@ -15,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.images import FORMATS
+from mcdenoise.data.images import FORMATS, Window
 from mcdenoise.data.readers.bmfr import BmfrFolder, find_frames, is_bmfr, open_bmfr
 from mcdenoise.data.readers.choice import parse_mapping
 from mcdenoise.data.readers.files import RenderedFiles
@@ -86,6 +86,11 @@ class Sequence:
         """
         self._check(number)
         return sorted(set(self._source.frame_files(number)))
+
+    @property
+    def window(self) -> Window | None:
+        """The window of all frames, if the files have data windows that differ; each is written in its own."""
+        return self._source.window if isinstance(self._source, RenderedFiles) else None
 
     def part(self, numbers: Sequential[int]) -> Sequence:
         """Select some frames, ascending; how the values are read does not change."""

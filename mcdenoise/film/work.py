@@ -24,6 +24,7 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import remove, sweep
+from mcdenoise.data.images import Window
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
@@ -273,7 +274,7 @@ def summarize(order: Order) -> Summary:
         write_report(opened.sequence, order.folder, opened.denoiser, report)
         if opened.shot.settings.preview:
             _preview(order, opened, report.files)
-    joints = _joints(order, records)
+    joints = _joints(order, records, opened.sequence.window)
     described = _described(records)
     warnings = [*opened.sequence.warnings, *report.warnings] if records else list(opened.sequence.warnings)
     for number, difference in joints.items():
@@ -438,7 +439,7 @@ def _joint_path(order: Order, number: int) -> Path:
     return order.records / f"joint{number}.exr"
 
 
-def _joints(order: Order, records: Collection[FrameRecord]) -> dict[int, float]:
+def _joints(order: Order, records: Collection[FrameRecord], window: Window | None) -> dict[int, float]:
     """The SMAPE between the two results of the frame before each joint."""
     found = {}
     for record in records:
@@ -446,7 +447,7 @@ def _joints(order: Order, records: Collection[FrameRecord]) -> dict[int, float]:
         if not path.is_file():
             continue
         try:
-            shown = open_result(order.result(record)).read()[0]
+            shown = open_result(order.result(record)).read(window)[0]
             other = torch.from_numpy(np.ascontiguousarray(read_exr(path)[0][..., :3])).permute(2, 0, 1)[None]
         except InputError:
             continue
@@ -503,6 +504,6 @@ def _preview(order: Order, opened: _Opened, files: Mapping[int, Path]) -> None:
     """Write the preview of `mcdenoise denoise --preview` from the files, whose frames were denoised in any order."""
     shown = opened.shot.settings.preview_in(order.folder, video=len(files) > 1)
     for path in files.values():
-        image, metadata = open_result(path).read()
+        image, metadata = open_result(path).read(opened.sequence.window)
         shown.add(path.stem, image, metadata)
     shown.close()

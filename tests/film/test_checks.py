@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import OpenEXR
 import pytest
 from shots import Inline, edit, same, write_manifest, write_shot
 
@@ -172,3 +174,18 @@ def test_a_result_that_vanishes_while_the_film_runs_is_made_again(
     monkeypatch.setattr(Sequence, "frame", frame)
     assert run(shot, out).complete
     assert len(list(out.glob("s1/*.exr"))) == 5
+
+
+def test_frames_of_several_windows_are_compared_and_shown_in_one(tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    (tmp_path / "in").mkdir()
+    for number in range(4):
+        size = {"dataWindow": (np.int32([number, 2]), np.int32([number + 20 + number, 17]))}
+        header = {**size, "displayWindow": (np.int32([0, 0]), np.int32([39, 29])), "type": OpenEXR.scanlineimage}
+        pixels = np.full((16, 21 + number), 0.5, np.float32)
+        OpenEXR.File({**header, "compression": OpenEXR.ZIP_COMPRESSION}, dict.fromkeys("RGB", pixels)).write(
+            str(tmp_path / f"in/a_{number}.exr")
+        )
+    manifest = write_manifest(tmp_path / "film.toml", {"a": tmp_path / "in"}, model="noisy", preview=True)
+    assert run_film(Film(read_film(manifest), tmp_path / "out"), Inline()).complete
+    assert (tmp_path / "out/a/preview.mp4").is_file()

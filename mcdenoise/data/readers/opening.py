@@ -118,20 +118,29 @@ class Result:
     Args:
         path: the file.
         layer: layer of the radiance.
-        size: height and width in pixels.
+        window: its data window.
     """
 
     path: Path
     layer: Layer
-    size: tuple[int, int]
+    window: Window
 
-    def read(self) -> tuple[Tensor, Metadata]:
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.window.size
+
+    def read(self, window: Window | None = None) -> tuple[Tensor, Metadata]:
         """Read ``(1, 3, H, W)`` radiance, and the attributes of the file.
+
+        Args:
+            window: what to read instead of the data window; 0 where that has no pixels.
 
         Raises:
             InputError: the file is damaged.
         """
         pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
+        pixels = pixels if window is None else window.of(pixels, self.window)
         image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
         return image, read_image_header(self.path).metadata
 
@@ -150,7 +159,7 @@ def open_result(path: Path) -> Result:
 
     chosen = choose(str(path), layers, {}, read)
     (layer, *_) = chosen.written
-    return Result(path, layer, parts[layer.part].size)
+    return Result(path, layer, parts[layer.part].window)
 
 
 def _check(shot: RenderedFiles) -> None:
