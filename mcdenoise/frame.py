@@ -565,7 +565,8 @@ def _ordinary(what: str, value: object) -> Tensor:
         found, advice = f"its subclass {type(value).__name__}", "pass as_subclass(torch.Tensor) of it"
     elif value.is_nested or value.layout != torch.strided:
         found, advice = "a nested one" if value.is_nested else f"one of {value.layout}", "pass to_dense() of it"
-    elif value.is_neg():
+    # A graph of torch.compile cannot ask.
+    elif not torch.compiler.is_compiling() and value.is_neg():
         found, advice = "a view with the negative bit", "pass resolve_neg() of it"
     elif value.dtype not in _FLOATS:
         expected = "a floating-point dtype" + ("" if not value.is_floating_point() else " of 16, 32 or 64 bits")

@@ -156,7 +156,7 @@ def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> Repai
         hole.flatten(1).all(1).any(),
         by_channel.amax(),
         ratio.amax(),
-        gained[gained.abs().argmax()],
+        gained.gather(0, gained.abs().argmax(0, keepdim=True)).sum(),
         torch.div(worst, color.shape[3], rounding_mode="floor"),
         worst % color.shape[3],
     ]
