@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import os
 import threading
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Literal, get_args
@@ -151,6 +152,12 @@ def _missing(backend: Backend) -> str:
 def _tried_import(backend: Backend) -> str:
     try:
         importlib.import_module(backend)
-    except Exception as error:  # so does a damaged file of settings, or too little memory for LLVM
-        return f"cannot be imported ({' '.join(str(error).split())}); install mcdenoise[{_EXTRAS[backend]}]"
+        if backend == "numba":
+            # What all its kernels need is loaded, too, as the memory of the process may end here.
+            importlib.import_module("mcdenoise.ops._numba._runtime")
+    except Exception as error:  # from a damaged file of settings to too little memory
+        reason = f"cannot be imported ({' '.join(str(error).split()) or type(error).__name__})"
+        if _FOUND[backend]:
+            warnings.warn(f"{backend} {reason}: plain torch is used, which is slower", stacklevel=2)
+        return f"{reason}; install mcdenoise[{_EXTRAS[backend]}]"
     return ""

@@ -20,6 +20,7 @@ import functools
 import importlib
 import inspect
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -118,7 +119,14 @@ def _load(backend: str, page: str, plain: Callable[..., Any]) -> None:
     with _loading:
         if (backend, name) in _loaded:
             return
-        module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
+        try:
+            module = importlib.import_module(f"mcdenoise.ops._{backend}.{page}")
+        except MemoryError:
+            warnings.warn(
+                f"{name}: too little memory for {backend}; plain torch is used, which is slower", stacklevel=3
+            )
+            _loaded[backend, name] = lambda *arguments: NotImplemented
+            return
         function: Callable[..., Any] = getattr(module, name)
         gradients = getattr(module, f"{name}_gradients", None)
         operator = getattr(gradients, "operator", function)
