@@ -9,7 +9,7 @@ import reprlib
 import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType
@@ -47,17 +47,20 @@ from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._journal import ask
 from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
-from mcdenoise.models._precision import Chosen
+from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapper import name_of
-from mcdenoise.noise import noise_of
+from mcdenoise.noise import noise_is_repeated, noise_of, thinned
 from mcdenoise.sampling import has_exact_features
 
 AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
 
+# Level of noise up to which bfloat16 makes errors larger: by 41 % at 0.001, 6 % at 0.006, 2 % at 0.02, 1 % at 0.06
+# (oidn_tuned on even surfaces, where they are largest).
+_ROUNDED = 0.03
 # Level of noise of frames with some eight samples a pixel; training/README.md has the errors of both models.
 _MANY_SAMPLES = 0.1
 
@@ -102,6 +105,7 @@ class FrameReport(Journal):
     Args:
         precision: the reason for the precision of the convolutions.
         repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
+        repeats: the advice for frames that repeat the noise of the frame before; empty for others.
         missing: buffers that would improve the result and that the frame lacks.
         beside: milliseconds of work that overlaps with denoising another frame: read, write.
     """
@@ -109,6 +113,7 @@ class FrameReport(Journal):
     precision: str = ""
     model: str = ""
     repairs: Repairs = field(default_factory=Repairs)
+    repeats: str = ""
     missing: list[str] = field(default_factory=list)
     beside: dict[str, float] = field(default_factory=dict)
 
@@ -156,12 +161,14 @@ class Denoiser:
         weights: a safetensors file of other weights for a model given by name.
         device: device to run on. Frames may come from any device; images are returned on this one.
         precision: precision of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
-            processors that support it. ``"auto"`` chooses it for a trained model of the zoo if it is faster on this
-            machine (see :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours, and
-            with ``differentiable``. ``"int8"`` computes the U-Nets of a calibrated model in 8-bit integers, on
-            processors with 8-bit dot products; docs/performance.md measures the loss of quality. The attribute
-            ``precision`` holds the chosen precision, and the report the reason.
-        keep_all: skip nothing, even if the scene does not need it.
+            processors that support it; frames with hardly any noise, which it would make worse, are computed in float32
+            all the same (on a GPU by the noise of the frame before, and the first one always). ``"auto"`` chooses it
+            for a trained model of the zoo if it is faster on this machine (see
+            :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours, and with
+            ``differentiable``. ``"int8"`` computes the U-Nets of a calibrated model in 8-bit integers, on processors
+            with 8-bit dot products; docs/performance.md measures the loss of quality. The attribute ``precision`` holds
+            the chosen precision, and the report the reason.
+        keep_all: skip nothing, even if the scene does not need it, nor a frame that repeats the noise of the last one.
         tile: largest side of a tile in pixels, a multiple of 32 that is at least 64. The result is that of the whole
             image, up to the rounding of convolutions; overlapping margins cost time. By default tiles are as large as
             memory allows, and the image is not tiled if a network's features take no more than 2 GB (on a GPU: 0.4 of
@@ -223,6 +230,8 @@ class Denoiser:
             # The only calibrated one of those that are picked.
             model = DEFAULT
         self._report = FrameReport()
+        # Whether the last frame whose noise is known has enough of it to be computed in bfloat16.
+        self._rounds = False
         # Set by a caller that never writes into a frame again after passing it: then no buffer is copied.
         self.frames_stay = False
         # Unset by a caller that shows what the reports doubt.
@@ -256,7 +265,7 @@ class Denoiser:
             if self.differentiable:
                 raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
             quantize(self.model, self.device)
-        self._tiles = Division(self.model, *self._limits, self.device, bfloat16=self.precision != "float32")
+        self._tiles = Division(self.model, *self._limits, self.device)
 
     @_in_turn
     def pick(self, frame: Frame | None) -> None:
@@ -315,6 +324,9 @@ class Denoiser:
         _check_kind("layers", layers, (int,), "a whole number")
         self._state: State = None
         self._doubted = False
+        # The state that the last frame continued, and a few of its pixels.
+        self._before: State = None
+        self._seen: Frame | None = None
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
@@ -333,6 +345,7 @@ class Denoiser:
             # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
+            shot = shot._replace(bfloat16=self.precision != "float32")
             with torch.set_grad_enabled(self.differentiable):
                 self.spills = self._tiles.spills(shot)
                 self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
@@ -352,7 +365,7 @@ class Denoiser:
     @_in_turn
     def detach(self) -> None:
         """Detach the history from the graph, for truncated backpropagation: later ``backward`` ends here."""
-        self._state = pytree.tree_map_only(Tensor, Tensor.detach, self._state)
+        self._state, self._before = pytree.tree_map_only(Tensor, Tensor.detach, (self._state, self._before))
 
     def has_history(self, buffers: Collection[str]) -> bool:
         """Whether frames with these buffers can have a history; otherwise motion is not needed."""
@@ -426,14 +439,15 @@ class Denoiser:
                 report.model = self._picked
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
-                report.tiles = self._tiles.divide(self._shot(frame))
+                precision, report.tiles = self._planned(frame, report)
+                before, seen = self._continued(frame, report)
                 # Repaired buffers are in memory again.
                 frame = frame.map(spilled) if self.spills else frame
                 drop_pages()
             noisy = frame.color
-            precision = computing_in(self.precision, self.device)
-            with precision, self._explained(dtype), timed(self._name, self.device):
-                output, state = checked_step(self.model, frame, self._state, self._shape)
+            computing = computing_in(precision, self.device)
+            with computing, self._explained(dtype), timed(self._name, self.device):
+                output, state = checked_step(self.model, frame, before, self._shape)
             with timed("validate", self.device):
                 # A renderer may write its next frame into the same buffers, and a user may change an image in place.
                 state = state if self.frames_stay else owned(state, [given, noisy])
@@ -445,6 +459,7 @@ class Denoiser:
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
+        self._before, self._seen = (None, None) if seen is None else (before, seen)
         return result
 
     def _prepared(self, frame: Frame, report: FrameReport) -> tuple[Frame, Void]:
@@ -467,8 +482,24 @@ class Denoiser:
         ask(repaired.numbers, judge)
         return repaired.frame
 
+    def _continued(self, frame: Frame, report: FrameReport) -> tuple[State, Frame | None]:
+        """The state that a frame continues, and its pixels to compare the next one with.
+
+        Where it repeats the noise of the frame before, it takes that frame's place in the history: equal noise counts
+        once. On a GPU, which is not read, with ``keep_all``, and for a history in files this is not looked for.
+        """
+        watches = at_hand(self.device) and self.has_history(frame.buffers) and not (self.spills or self.keep_all)
+        seen = thinned(frame) if watches else None
+        if seen is None or self._seen is None or not noise_is_repeated(frame, seen, self._seen):
+            # Before a network runs, so that it has the memory.
+            self._before = None
+            return self._state, seen
+        report.repeats = "the noise is that of the frame before, pixel by pixel; render each frame with its own seed"
+        self._doubt(report.repeats)
+        return self._before, seen
+
     def _doubt(self, text: str) -> None:
-        """Warn of changed light, once a shot."""
+        """Warn of changed light or equal noise, once a shot."""
         if text and self.warns and not self._doubted:
             self._doubted = True
             warnings.warn(text, stacklevel=level_of_caller())
@@ -479,6 +510,7 @@ class Denoiser:
             self._report.settle()
         except InputError as error:
             self._state, self._shape, self._layers = None, (), ()
+            self._before = self._seen = None
             raise InputError(f"{error} (of the last frame, told a frame late; the history begins anew)") from error
 
     def _check_layers(self, frame: Frame) -> None:
@@ -513,6 +545,28 @@ class Denoiser:
         exact = self.differentiable and frame.color.dtype == torch.float64
         weights = self.model.parameters() if isinstance(self.model, nn.Module) else ()
         return torch.float64 if exact and all(each.dtype == torch.float64 for each in weights) else torch.float32
+
+    def _planned(self, frame: Frame, report: FrameReport) -> tuple[Precision, str]:
+        """The precision of a frame, and its tiles, in words.
+
+        Raises:
+            InputError: not even the smallest tiles fit.
+        """
+        shot = self._shot(frame)
+        if self.precision == "bfloat16":
+
+            def hear(levels: Sequence[float]) -> None:
+                self._rounds = min(levels) > _ROUNDED
+
+            # A GPU tells it when the next frame comes.
+            ask(noise_of(frame.color, frame.albedo, frame.normal).level, hear)
+            if not self._rounds:
+                # Less memory than float32 needs may have been allowed.
+                with suppress(InputError):
+                    tiles = self._tiles.divide(shot)
+                    report.precision = "float32, since the frame has hardly any noise, and bfloat16 would add some"
+                    return "float32", tiles
+        return self.precision, self._tiles.divide(shot._replace(bfloat16=self.precision != "float32"))
 
     def _shot(self, frame: Frame) -> Frames:
         streaming = self.has_history(frame.buffers)

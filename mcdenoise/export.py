@@ -153,6 +153,9 @@ def traced(step: Step) -> torch.export.ExportedProgram:
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:300] or type(error).__name__
+        if "Constraints violated" in reason:
+            # Python's len() is a number, where the graph needs the size of any batch.
+            reason = f"a size that is fixed, such as that of len(x): write x.shape[0]; {reason}"
         raise InputError(
             f"model: expected one that torch.export can trace for images of any size, found {type(error).__name__}: "
             f"{reason}"

@@ -107,6 +107,9 @@ class SequenceReport:
         if doubts := [(number, done.repairs.doubt) for number, done in self.frames.items() if done.repairs.doubt]:
             number, doubt = doubts[0]
             found.append(f"{doubt} (frame {number}, and {len(doubts) - 1} others of {len(self.frames)})")
+        if repeated := [(number, done.repeats) for number, done in self.frames.items() if done.repeats]:
+            number, advice = repeated[0]
+            found.append(f"{advice} (frame {number}, and {len(repeated) - 1} others of {len(self.frames)})")
         # These files may be other frames of the same shot and hours of work: only the user may remove them.
         if self.older:
             names = ", ".join(self.older if len(self.older) <= 4 else [self.older[0], "...", self.older[-1]])
@@ -261,7 +264,8 @@ def write_frames(
                 on_output(frame, output)
                 output = output._replace(stages={})
             seen, before = _thumbnail(frame), seen
-            if _finds_nothing(denoiser.report, frame) and _alike(seen, before):
+            repeats = denoiser.report.repeats
+            if not repeats and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
                 report.alike.append(number)
             del frame
             start = time.perf_counter()

@@ -12,7 +12,7 @@ from typing import Any
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.models import find_model, model_of
+from mcdenoise.models import find_model, has_random_weights, model_of
 
 WEIGHTS = ".safetensors"
 # A name or path, optionally followed by settings in parentheses.
@@ -42,6 +42,16 @@ class Spelling:
             name = f"{Path(path).name}:{factory}"
         settings = ", ".join(f"{setting}={value}" for setting, value in self.settings.items())
         return f"{name}({settings})" if settings else name
+
+    @property
+    def doubt(self) -> str:
+        """A warning if the model is the user's own and has random weights; otherwise empty."""
+        if self.weights is not None or not has_random_weights(self.model, self.settings):
+            return ""
+        return (
+            f"model '{self.model}': its weights are random, and others in each run; train it, and name their file, as "
+            f"'{self.model}(weights=FILE)', or let its factory load them"
+        )
 
     def takes(self, setting: str) -> bool:
         """Whether the model's constructor has such a setting."""

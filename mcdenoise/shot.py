@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.readers.opening import ColorSpace
 from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
@@ -42,6 +43,10 @@ class ShotSettings:
         color_without_albedo: the noisy color was divided by the albedo, and has to be multiplied by it.
         color_with_albedo: the noisy color includes the albedo. By default this is determined from the values; if they
             do not tell, the color is assumed to include it.
+        input_color_space: of the color in TIFF, PNG, PFM and HDR files, linear or srgb; auto takes what the files say
+            (ICC profile, gamma, color space), or else srgb for 8 and 16 bits, and linear for floats. The result is
+            written in it.
+        input_linear: the same as --input-color-space linear.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
             patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
@@ -77,6 +82,8 @@ class ShotSettings:
     map: tuple[str, ...] = ()
     color_without_albedo: bool = False
     color_with_albedo: bool = False
+    input_color_space: ColorSpace = "auto"
+    input_linear: bool = False
     output_layer: str | None = None
     layers: tuple[str, ...] = ()
     alpha: bool = False
@@ -114,6 +121,8 @@ class ShotSettings:
                 raise InputError(f"--{name}: expected a number above 0, found {limit:g}")
         if self.color_with_albedo and self.color_without_albedo:
             raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
+        if self.input_linear and self.input_color_space == "srgb":
+            raise InputError("--input-linear, --input-color-space: expected one of them, found both")
         if self.is_budgeted and (self.weights is not None or self.model is not None):
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
 
@@ -139,8 +148,11 @@ class ShotSettings:
             InputError: see :func:`mcdenoise.data.open_sequence`; or the frames lack a requested buffer.
         """
         self.check()
+        space: ColorSpace = "linear" if self.input_linear else self.input_color_space
         stated = self.color_with_albedo if self.color_with_albedo or self.color_without_albedo else None
-        opened = open_sequence(inputs, self.frames, mapping=self.map, color_has_albedo=stated, lights=self.layers)
+        opened = open_sequence(
+            inputs, self.frames, mapping=self.map, color_has_albedo=stated, lights=self.layers, color_space=space
+        )
         if self.output_layer is not None:
             opened.check_output_layer(self.output_layer)
         if self.alpha and "alpha" not in opened.buffers:

@@ -691,6 +691,27 @@ def test_gradcheck(run: Callable[..., tuple[int, str, str]], refused: Callable[.
     assert "cascade_loss" in refused("gradcheck", "cascade_loss")
 
 
+def test_random_weights_are_said(
+    run: Callable[..., tuple[int, str, str]], small_sequence: Path, out: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "own.py"
+    own.write_text(
+        "import torch\n\n\nclass Net(torch.nn.Module):\n    def __init__(self):\n        super().__init__()\n"
+        "        self.layer = torch.nn.Conv2d(3, 3, 1)\n\n    def forward(self, color):\n"
+        "        return self.layer(color).abs()\n\n\n"
+        "def trained():\n    net = Net()\n    torch.nn.init.dirac_(net.layer.weight)\n"
+        "    torch.nn.init.zeros_(net.layer.bias)\n    return net\n"
+    )
+    for name, said in (("Net", 1), ("trained", 0)):
+        for command in (
+            ("denoise", small_sequence, "-o", out / name, "--model", f"{own}:{name}"),
+            ("evaluate", small_sequence, "--model", f"{own}:{name}"),
+        ):
+            status, _, errors = run(*command)
+            assert status == 0
+            assert len(re.findall(r"^warning: .*random", errors, re.MULTILINE)) == said
+
+
 # Training and rendering
 
 

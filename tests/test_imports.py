@@ -47,7 +47,7 @@ ALLOWED: dict[str, set[str]] = {
     "ops": set(),
     "light": {"errors", "ops"},
     "frame": {"errors", "light", "ops"},
-    "noise": {"ops"},
+    "noise": {"frame", "ops"},
     "sampling": {"frame"},
     "metrics": SIGNAL,
     "nn": SIGNAL,

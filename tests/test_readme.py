@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from mcdenoise.check.cases import OPS
+from mcdenoise.cli import main
+from mcdenoise.data import read_exr
 from mcdenoise.models import list_models
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -69,6 +71,46 @@ def test_the_streaming_example_has_a_history() -> None:
 def test_the_composed_example_has_a_history() -> None:
     report = code_with(ROOT / "README.md", "denoiser = Denoiser")["denoiser"].report
     assert (report.reset, report.missing, report.replaced_pixels) == ("", [], 0)
+
+
+def test_the_composed_example_does_what_is_promised(
+    tmp_path: Path, small_sequence: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is trained, and with its weights it denoises and is measured."""
+    pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
+    monkeypatch.chdir(tmp_path)
+    write_composed(tmp_path)
+
+    def run(line: str) -> int:
+        with pytest.raises(SystemExit) as stop:
+            main(line.format(shot=small_sequence).split())
+        return int(stop.value.code or 0)
+
+    small = "--steps 2 --crop 16 --frames 2 --batch 1 --validation-frames 0"
+    assert run(f"train {{shot}} -o run --model mine.py:network {small}") == 0
+    assert run("denoise {shot} -o out --model mine.py:network --weights run/network.safetensors") == 0
+    assert "random" not in capsys.readouterr().err
+    pixels = [read_exr(path)[0] for path in sorted((tmp_path / "out").glob("*.exr"))]
+    assert len(pixels) == 4
+    assert all((image >= 0).all() for image in pixels)
+    measured = "mine.py:network(weights=run/network.safetensors)"
+    assert run(f"benchmark {{shot}} -o results --models {measured} --precisions float32 --sizes none --rounds 1") == 0
+
+
+@pytest.mark.slow
+def test_the_composed_example_is_exported_and_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_composed(tmp_path)
+    for line in ("export mine.py:network -o mine.pt2", "stability --models mine.py:network --frames 20"):
+        with pytest.raises(SystemExit) as stop:
+            main(line.split())
+        assert not stop.value.code, line
+
+
+def write_composed(folder: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    block = next(block for block in blocks if "def network" in block)
+    (folder / "mine.py").write_text(block.partition("\ndenoiser = ")[0])
 
 
 def test_the_composed_denoiser_denoises() -> None:

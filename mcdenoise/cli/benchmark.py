@@ -16,11 +16,12 @@ from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_row
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops
 from mcdenoise.cli._options import Json, parse_size
-from mcdenoise.cli._output import print_rows, progress_bar, say, write_json
+from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
 from mcdenoise.cli._suite import SHOWN, score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
+from mcdenoise.methods import Spelling
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.shot import check_threads
 
@@ -173,6 +174,10 @@ def benchmark(
     check_packages()
     opened = [open_sequence(sequence, frames) for sequence in sequences]
     methods = choose_methods(models, precisions=precisions, keep_all=keep_all)
+    tried = {
+        each.model: Spelling(each.model, None, each.settings) for each in methods if not each.weights + each.missing
+    }
+    warn(filter(None, (each.doubt for each in tried.values())))
     with progress_bar() as progress:
         task = progress.add_task("benchmark", total=None)
         results = run_benchmark(

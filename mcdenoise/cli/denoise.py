@@ -63,6 +63,7 @@ def denoise(
     # Before anything is printed about a shot that cannot be written.
     prepare_folder(opened, out)
     print_sequence(opened)
+    warn(filter(None, [spelling.doubt]))
     began = time.perf_counter()
     with progress_bar() as progress, _backend(opened, resolved):
         task = progress.add_task("denoise", total=len(opened))

@@ -9,7 +9,7 @@ import tyro
 from rich.table import Table
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import progress_bar, say, show, write_json
+from mcdenoise.cli._output import progress_bar, say, show, warn, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_method
@@ -59,6 +59,7 @@ def evaluate(
             result = evaluate_folder(opened, images, protocol=protocol, on_frame=advance)
         elif spelling is not None:
             denoiser = spelling.denoiser(device=device)
+            warn(filter(None, [spelling.doubt]))
             result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
     write_json(json, result.as_json())

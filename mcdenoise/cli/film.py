@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +52,10 @@ def film(
     if ray is not None and workers is not None:
         raise InputError("--workers, --ray: expected one of them, found both")
     shots = read_film(manifest, shot)
+    for settings in {each.settings.model: each.settings for each in shots if each.settings.model}.values():
+        # The check of the film names a shot whose model cannot be made.
+        with suppress(InputError):
+            warn(filter(None, [settings.spelling.doubt]))
     engine: Engine
     threads = None
     if ray is not None:

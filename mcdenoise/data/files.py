@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mcdenoise.errors import InputError
 from mcdenoise.interruption import unfinished
@@ -83,7 +83,7 @@ def held(folder: Path, work: str) -> Iterator[None]:
     """Lock a folder for this process; the lock is released when the process ends in any way.
 
     Args:
-        folder: folder that gets the lock file, which may remain there.
+        folder: folder that gets the lock file; that of a killed process is taken over.
         work: the kind of work, one word, for the message.
 
     Raises:
@@ -95,23 +95,40 @@ def held(folder: Path, work: str) -> Iterator[None]:
         ...     pass
     """
     path = folder / ".lock"
-    with _writing(path):
-        file = path.open("a+", encoding="utf-8")
-    with file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
+    with _locked(path, folder, work) as file:
+        with _writing(path):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
+            file.flush()
+        try:
+            yield
+        finally:
+            if fcntl is not None:
+                with suppress(OSError):
+                    path.unlink()
+
+
+def _locked(path: Path, folder: Path, work: str) -> IO[str]:
+    """Open and lock a lock file."""
+    while True:
+        with _writing(path):
+            file = path.open("a+", encoding="utf-8")
+        if fcntl is None:
+            return file
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The process that held the lock may have removed its file after this one had opened it.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    return file
+            file.close()
+        except BlockingIOError as error:
+            with file:
                 file.seek(0)
                 raise InputError(
                     f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
                     "wait for it, or choose another folder"
                 ) from error
-        with _writing(path):
-            file.truncate(0)
-            file.write(f"process {os.getpid()} of {platform.node()} at work in it")
-            file.flush()
-        yield
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -46,6 +47,8 @@ _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
 # the time for a frame of 60 channels and take hundreds of megabytes; fewer would decode a chunk repeatedly.
 _ROWS = {"none": 16, "rle": 16, "zips": 16, "zip": 16, "pxr24": 16, "piz": 32, "b44": 32, "b44a": 32, "dwaa": 32}
 _MOST_ROWS = 256
+# Largest difference of a curve from a straight line.
+_STEP = 1 / 512
 EXR_SUFFIXES = {suffix for suffix, name in FORMATS.items() if name == "openexr"}
 _PNG = b"\x89PNG\r\n\x1a\n"
 _INTEGERS = {"uint", "int"}
@@ -53,6 +56,37 @@ _INTEGERS = {"uint", "int"}
 _CHROMA = {"ry", "by"}
 # More than OpenImageIO's default limit: a shot with all passes of 300 lights exceeds that.
 oiio.attribute("limits:channels", _LARGEST_CHANNELS)
+
+
+class Window(NamedTuple):
+    """Pixels from a first row and column to those before an end, in the display window's coordinates."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.bottom - self.top, self.right - self.left
+
+    def joined(self, other: Window) -> Window:
+        """The smallest window with both."""
+        low, high = map(min, self[:2], other[:2]), map(max, self[2:], other[2:])
+        return Window(*low, *high)
+
+    def of(self, image: Image, own: Window, fill: float = 0.0) -> Image:
+        """The pixels of this window, from an ``(H, W, C)`` image of another; filled where that has none."""
+        if self == own:
+            return image
+        found = np.full((*self.size, *image.shape[2:]), fill, image.dtype)
+        top, left = max(self.top, own.top), max(self.left, own.left)
+        bottom, right = max(top, min(self.bottom, own.bottom)), max(left, min(self.right, own.right))
+        found[top - self.top : bottom - self.top, left - self.left : right - self.left] = image[
+            top - own.top : bottom - own.top, left - own.left : right - own.left
+        ]
+        return found
 
 
 @dataclass(frozen=True)
@@ -65,7 +99,9 @@ class Part:
         origin: row and column of its first pixel in the display window.
         channels: names of the channels, R, G, B first.
         integers: channels that are stored as integers, such as object ids.
-        display_referred: whether the pixels are display values (sRGB), as in an 8-bit PNG.
+        display_referred: whether the pixels are display values, as in an 8-bit PNG.
+        display: height, width, first row and column of the display window.
+        gamma: exponent of the display curve, if it is a power; 0 for the curve of sRGB.
     """
 
     name: str
@@ -74,6 +110,14 @@ class Part:
     channels: tuple[str, ...]
     integers: frozenset[str]
     display_referred: bool
+    display: tuple[int, int, int, int] = (0, 0, 0, 0)
+    gamma: float = 0.0
+
+    @property
+    def window(self) -> Window:
+        """The data window."""
+        (height, width), (top, left) = self.size, self.origin
+        return Window(top, left, top + height, left + width)
 
 
 @dataclass(frozen=True)
@@ -262,7 +306,7 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             channels = tuple(spec.channelnames)
             metadata = metadata or picture_metadata(spec)
             part_name = _text(spec, "oiio:subimagename") or _text(spec, "name")
-            space = _text(spec, "oiio:ColorSpace").lower()
+            gamma = _gamma_of(spec) if name in ("png", "tiff") else None
         except UnicodeDecodeError as error:
             raise _refused(path, "names that are no text") from error
         pixels = spec.width * spec.height
@@ -284,9 +328,13 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         if name == "openexr" and file.seek_subimage(len(parts), 1):
             raise _refused(path, "a texture of several resolutions", "write the largest one alone")
         integers = frozenset(c for c, kind in zip(channels, kinds, strict=True) if kind in _INTEGERS)
-        display = name in ("png", "tiff") and kinds[0] in ("uint8", "uint16") and "lin" not in space
+        # Floats, and files that say nothing, have the usual curve of their kind.
+        usual = kinds[0] in ("uint8", "uint16") if gamma is None else gamma != 1
+        display = name in ("png", "tiff") and usual
         size, origin = (spec.height, spec.width), (spec.y, spec.x)
-        parts.append(Part(part_name, size, origin, channels, integers, display))
+        whole = (spec.full_height, spec.full_width, spec.full_y, spec.full_x)
+        gamma = gamma or 0.0 if display else 0.0
+        parts.append(Part(part_name, size, origin, channels, integers, display, whole, gamma))
         if name != "openexr":
             break
     pending_error(file)
@@ -299,6 +347,44 @@ def _text(spec: oiio.ImageSpec, name: str) -> str:
     """A text in a header; empty if there is none of that name, or something else."""
     value = spec.getattribute(name)
     return value if isinstance(value, str) else ""
+
+
+def _gamma_of(spec: oiio.ImageSpec) -> float | None:
+    """Exponent of the curve that a file states: 1 for linear light, 0 for the curve of sRGB; ``None`` if none."""
+    profile = spec.getattribute("ICCProfile")
+    if isinstance(profile, np.ndarray) and (found := _gamma_of_profile(profile.tobytes())) is not None:
+        return found if 0.1 < found < 10 else 0.0
+    space = _text(spec, "oiio:ColorSpace").lower()
+    if "lin" in space:
+        return 1.0
+    stated = spec.getattribute("oiio:Gamma")
+    gamma = stated if isinstance(stated, float) and 0.1 < stated < 10 else 0.0
+    # Without any statement, OpenImageIO says that a PNG is sRGB.
+    return gamma if gamma or "srgb" in space else None
+
+
+def _gamma_of_profile(profile: bytes) -> float | None:
+    """The same from an ICC profile's curve of red or grey (ICC.1:2022, 7.3, 10.6, 10.18)."""
+    try:
+        (count,) = struct.unpack_from(">I", profile, 128)
+        tags = (struct.unpack_from(">4sII", profile, 132 + 12 * i) for i in range(min(count, 100)))
+        start = next((start for name, start, _ in tags if name in (b"rTRC", b"kTRC")), None)
+        if start is None:
+            return None
+        kind, _, values = struct.unpack_from(">4sII", profile, start)
+        if kind == b"para":
+            power = float(struct.unpack_from(">i", profile, start + 12)[0]) / 2**16
+            # Only the first of the five functions is a power; the others are like that of sRGB.
+            return power if values >> 16 == 0 or power == 1 else 0.0
+        if kind != b"curv":
+            return None
+        table = np.frombuffer(profile, ">u2", values, start + 12)
+        if values == 1:
+            return float(table[0]) / 256
+        straight = np.linspace(0, 1, values)
+        return 1.0 if np.abs(table / 65535 - straight).max(initial=0) < _STEP else 0.0
+    except (struct.error, ValueError):
+        return None
 
 
 def _refused(path: Path, found: str, advice: str = "render a flat image of at most 2^28 pixels") -> InputError:

@@ -21,7 +21,7 @@ from mcdenoise.data.readers.choice import parse_mapping
 from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.data.readers.names import find_files, group_files
 from mcdenoise.data.readers.noisebase import NoisebaseFiles, find_zips, open_noisebase
-from mcdenoise.data.readers.opening import open_files
+from mcdenoise.data.readers.opening import ColorSpace, open_files
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -247,6 +247,7 @@ def open_sequence(
     mapping: Sequential[str] = (),
     color_has_albedo: bool | None = None,
     lights: Sequential[str] = (),
+    color_space: ColorSpace = "auto",
 ) -> Sequence:
     """Open the frames of a shot: the headers of all selected files are checked, and the pixels of the first frame.
 
@@ -257,6 +258,8 @@ def open_sequence(
         mapping: layers by buffer if names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
         lights: names of layers of light that add up to the color, or ``("all",)``: frames have them in ``layers``.
+        color_space: ``"linear"`` or ``"srgb"`` for TIFF, PNG, PFM and HDR files; by default what the files say, or
+            else sRGB for 8 and 16 bits, and linear for floats.
 
     Raises:
         InputError: nothing was found, the files cannot be recognised, a frame or buffer is missing, or files do not
@@ -298,6 +301,7 @@ def open_sequence(
             mapping=parse_mapping(mapping),
             color_has_albedo=color_has_albedo,
             lights=lights,
+            color_space=color_space,
         )
     return _wrap(given[0], layout, source, found)
 

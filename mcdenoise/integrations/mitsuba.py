@@ -182,7 +182,7 @@ class MitsubaDenoiser:
     ) -> Any:
         layers = {noisy_ch: noisy}
         if noisy.pixel_format() == self._mi.Bitmap.PixelFormat.MultiChannel:
-            layers = dict(noisy.split())
+            layers = self._split(noisy)
 
         def layer(argument: str, name: str) -> Any:
             if name not in layers:
@@ -210,6 +210,27 @@ class MitsubaDenoiser:
         result = self._mi.Bitmap(pixels, kind)
         result.set_premultiplied_alpha(image.premultiplied_alpha())
         return result
+
+    def _split(self, bitmap: Any) -> dict[str, Any]:
+        """The layers of a bitmap by name. ``mi.Bitmap.split`` fails on some that were written to a file and read."""
+        try:
+            return dict(bitmap.split())
+        except RuntimeError:
+            names = [field.name for field in bitmap.struct_()]
+        places: dict[str, list[int]] = {}
+        for place, name in enumerate(names):
+            places.setdefault(name.rpartition(".")[0] or _ROOT, []).append(place)
+        pixels, layers = np.array(bitmap), {}
+        for name, own in places.items():
+            letters = {names[place].rpartition(".")[2]: place for place in own}
+            order = [letter for letter in "RGBXYZA" if letter in letters]
+            kind = "".join(order) if len(order) == len(own) else ""
+            # Vectors have these components, too, and are in no color space.
+            known = kind in (*_FORMATS, "XYZ", "XYZA") and (name == _ROOT or not kind.startswith("XYZ"))
+            form = getattr(self._mi.Bitmap.PixelFormat, kind if known else "MultiChannel")
+            chosen = [letters[letter] for letter in order] if known else own
+            layers[name] = self._mi.Bitmap(np.ascontiguousarray(pixels[..., chosen]), form)
+        return layers
 
     def _tensors(
         self,

@@ -32,6 +32,8 @@ _GPU_FRACTION = 0.4
 # freed pieces.
 _LOADED_LATER = 0.45 * GB
 _BYTES = 4
+# Kinds of frames whose tiles are remembered: sizes may be ever new ones.
+_TILINGS = 16
 # Channels of a history: a long and a recent one, the moments by which they are compared, and the length.
 _KEPT = 10
 # Channels of a layer, measured: as given, without albedo, two histories of six, each scale, and temporary results.
@@ -63,22 +65,19 @@ class Division:
         side: of the tiles in pixels, a multiple of 32 from 64 on; by default as memory allows.
         max_memory: in GB, see :class:`mcdenoise.denoiser.Denoiser`.
         device: where the model runs.
-        bfloat16: whether its convolutions are in bfloat16.
 
     Raises:
         InputError: side or memory are no such number, both are given, or the model computes no tiles.
     """
 
-    def __init__(
-        self, model: Model, side: int | None, max_memory: float | None, device: torch.device, *, bfloat16: bool
-    ) -> None:
+    def __init__(self, model: Model, side: int | None, max_memory: float | None, device: torch.device) -> None:
         self._tiled = [tiled for tiled in parts_of(model, Tiled) if tiled.halo is not None]
         self._memory = check_limits(side, max_memory, device)
         if not self._tiled and (side, max_memory) != (None, None):
             raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
         # Methods with a history of another kind keep it in memory.
         self._accumulated = parts_of(model, Accumulated)
-        self._side, self._bfloat16 = side, bfloat16
+        self._side = side
         self._tilings: dict[Frames, Tiling] = {}
 
     def divide(self, frames: Frames) -> str:
@@ -100,7 +99,7 @@ class Division:
     def spills(self, frames: Frames) -> bool:
         """Whether frames and their history have to be kept in files."""
         possible = CAN_SPILL and bool(self._tiled and self._accumulated) and not torch.is_grad_enabled()
-        return possible and frames.streaming and self._memory.is_short(frames, self._network())
+        return possible and frames.streaming and self._memory.is_short(frames, self._network(frames))
 
     def has_room_ahead(self, frames: Frames) -> bool:
         """Whether the next frame can be read, and the last one be written, while one is denoised.
@@ -114,20 +113,22 @@ class Division:
             self._tiling(frames._replace(spilled=True))
             return False
         self._tiling(frames)
-        return self._memory.has_room_ahead(frames, self._network())
+        return self._memory.has_room_ahead(frames, self._network(frames))
 
     def _tiling(self, frames: Frames) -> Tiling:
         if frames not in self._tilings:
+            if len(self._tilings) == _TILINGS:
+                self._tilings.clear()
             if self._side is not None:
                 tiling = Tiling(self._side, f"{describe(frames.size, self._side)}: as asked for")
             else:
-                tiling = self._memory.choose(frames, self._network())
+                tiling = self._memory.choose(frames, self._network(frames))
             self._tilings[frames] = tiling
         return self._tilings[frames]
 
-    def _network(self) -> Network:
+    def _network(self, frames: Frames) -> Network:
         halo = max(tiled.halo or 0 for tiled in self._tiled)
-        return Network(halo, max(tiled.bytes_per_pixel(bfloat16=self._bfloat16) for tiled in self._tiled))
+        return Network(halo, max(tiled.bytes_per_pixel(bfloat16=frames.bfloat16) for tiled in self._tiled))
 
 
 class Memory:
@@ -220,6 +221,7 @@ class Frames(NamedTuple):
         batch: number of images.
         carried: number of layers, with the rest that is in none of them, and of denoised alphas.
         spilled: frames and history are in files, see :mod:`mcdenoise.models._spilled`.
+        bfloat16: convolutions are in bfloat16, or in integers.
     """
 
     size: tuple[int, int]
@@ -229,6 +231,7 @@ class Frames(NamedTuple):
     batch: int = 1
     carried: int = 0
     spilled: bool = False
+    bfloat16: bool = False
 
     @property
     def held(self) -> int:

@@ -220,6 +220,24 @@ def _check_settings(name: str, given: dict[str, Any], fixed: dict[str, Any]) -> 
         )
 
 
+def has_random_weights(name: str, settings: dict[str, Any]) -> bool:
+    """Whether a model that is not of the zoo has other weights each time that it is made, so that it was not trained.
+
+    Raises:
+        InputError: see :func:`build_model`.
+    """
+    if find_model(name).of_zoo:
+        return False
+    made = []
+    with torch.random.fork_rng(devices=[]):
+        for seed in range(2):
+            torch.manual_seed(seed)
+            model = build_model(name, **settings)
+            made.append(model.state_dict() if isinstance(model, nn.Module) else {})
+    first, second = made
+    return first.keys() != second.keys() or not all(torch.equal(first[key], second[key]) for key in first)
+
+
 def start_with(model: Model, name: str, **settings: Any) -> str:
     """Copy the weights of another model to the layers of the same names.
 

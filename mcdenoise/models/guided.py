@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
@@ -18,9 +19,8 @@ from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.joint_bilateral import guide_of
+from mcdenoise.models.joint_bilateral import guide_of, guide_statistics
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import scale_of_depth
 
 DEPTH_SCALE = 10.0
 # Memory for each pixel of a tile, measured: its covariance matrix of seven guides, and the solver.
@@ -32,7 +32,7 @@ class Guided(nn.Module):
 
     In each window the light is a linear function of the guides (He et al. 2010, Eqs. 4 to 6), and each pixel takes the
     mean of the functions of all windows in which it lies (Eq. 8), so that the light keeps the edges of the guides. A
-    linear function may be negative, and is clamped to 0. Without features the light is its own guide.
+    linear function may be negative, and is clamped to 0. Without features the light's logarithm is the guide.
 
     Args:
         radius: radius of the windows in pixels, at least 1.
@@ -40,7 +40,7 @@ class Guided(nn.Module):
             and normals have their own unit, depths are 10 times :func:`mcdenoise.nn.normalize_depth`.
 
     Raises:
-        InputError: a setting is out of its range.
+        InputError: a setting is out of its range, or so small for a frame that the linear functions are undefined.
     """
 
     def __init__(self, radius: int = 4, eps: float = 1e-2) -> None:
@@ -57,8 +57,8 @@ class Guided(nn.Module):
         return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=2 * self.radius)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The scale of depths, see :func:`mcdenoise.nn.normalize_depth`."""
-        return scale_of_depth(frame)
+        """See :func:`mcdenoise.models.joint_bilateral.guide_statistics`."""
+        return guide_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes."""
@@ -72,7 +72,10 @@ class Guided(nn.Module):
         guide, size = guide_of(frame, DEPTH_SCALE), 2 * self.radius + 1
         # The linear functions of all images in one: their coefficients are of the same guides.
         images = with_carried(frame)
-        blurred: Tensor = guided_blur(guide, images, size, self.eps, border_type="replicate", separable=True)
+        try:
+            blurred: Tensor = guided_blur(guide, images, size, self.eps, border_type="replicate", separable=True)
+        except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+            raise InputError(f"eps: expected more than the guides' rounding, found {self.eps:g}; take 0.01") from error
         return answered(frame, blurred.clamp_min(0)), None
 
 

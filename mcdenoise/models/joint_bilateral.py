@@ -19,7 +19,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
-from mcdenoise.nn.inputs import scale_of_depth
+from mcdenoise.nn.inputs import auto_exposure, scale_of_depth
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import normalized_depth
 
@@ -34,7 +34,7 @@ _CHANNELS = 10  # of image and guide
 class JointBilateral(nn.Module):
     """``kornia.filters.joint_bilateral_blur``, guided by albedo, normal and depth, as far as the frame has them.
 
-    A frame without any guides itself, which is the bilateral filter.
+    A frame without any guides itself by its logarithm, which is the bilateral filter.
 
     Args:
         sigma_color: standard deviation in the guides' space, where albedos and normals have their own unit and depths
@@ -65,8 +65,8 @@ class JointBilateral(nn.Module):
         return max((pixels - 2 * self.radius) // TILE, 2) * TILE
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The scale of depths, see :func:`mcdenoise.nn.normalize_depth`."""
-        return scale_of_depth(frame)
+        """See :func:`guide_statistics`."""
+        return guide_statistics(frame)
 
     def bytes_per_pixel(self, *, bfloat16: bool) -> float:
         """Memory that a tile takes: its windows, unfolded, and as much again for their weights' derivatives."""
@@ -92,12 +92,23 @@ class JointBilateral(nn.Module):
 
 
 def guide_of(frame: Frame, depth_weight: float) -> Tensor:
-    """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color."""
+    """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color's logarithm.
+
+    That is ``log1p(e x)`` with the exposure ``e`` of the image, so that no unit and no lamp matters.
+    """
     guides = [image for image in (frame.albedo, frame.normal) if image is not None]
+    statistics = {**frame.statistics, **guide_statistics(frame)}
     if frame.depth is not None:
-        near, typical = {**frame.statistics, **scale_of_depth(frame)}["depth_scale"].split(1, 1)
+        near, typical = statistics["depth_scale"].split(1, 1)
         guides.append(depth_weight * normalized_depth(frame.depth, near, typical))
-    return torch.cat(guides or [frame.color], 1)
+    return torch.cat(guides, 1) if guides else torch.log1p(frame.color * statistics["exposure"])
+
+
+def guide_statistics(frame: Frame) -> dict[str, Tensor]:
+    """The values of the whole image that :func:`guide_of` needs: the scale of depths, or the exposure."""
+    if frame.albedo is None and frame.normal is None and frame.depth is None and "exposure" not in frame.statistics:
+        return {"exposure": auto_exposure(frame.color)}
+    return scale_of_depth(frame)
 
 
 @register_model("joint_bilateral", kind="filter", paper="Petschnigg et al. 2004")

@@ -94,7 +94,8 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
             from ``coarse``.
 
     Returns:
-        ``(B, C, H, W)`` in the dtype of ``fine``. Half precision is computed in float32.
+        ``(B, C, H, W)`` in the dtype of ``fine``, which can be negative where the inputs are not: radiance needs a
+        ``relu()`` behind it. Half precision is computed in float32.
 
     Raises:
         TypeError: an argument is no floating-point tensor.

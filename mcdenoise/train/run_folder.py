@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import reprlib
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,9 +52,7 @@ class RunFolder:
         for name, content in identity.items():
             path = self.out / f"{name}.json"
             if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):
-                raise InputError(
-                    f"{path}: expected the same as in this run, found another; choose a new folder for a new run"
-                )
+                raise InputError(f"{path}: {_difference(path, content)}; choose a new folder for a new run")
 
     def claim(self, **identity: Any) -> None:
         """Write the identity of the run to ``NAME.json``, or check that an earlier run wrote the same.
@@ -184,6 +183,23 @@ def _last_step(line: bytes) -> float:
         return float(entry.get("step", entry.get("first_step", math.inf)))
     except (ValueError, AttributeError, TypeError, RecursionError, OverflowError):
         return math.inf
+
+
+def _difference(path: Path, content: Any) -> str:
+    """The settings of a stored run that are not those of this run, with both values."""
+    try:
+        stored = json.loads(read_text(path, _LARGEST))
+        # Numbers and tuples as a file has them.
+        wanted = json.loads(_json(content))
+        other = [name for name in {**wanted, **stored} if stored.get(name) != wanted.get(name)]
+        expected, found = (
+            ", ".join(f"{name}={reprlib.repr(values.get(name))}" for name in other) for values in (wanted, stored)
+        )
+        if other:
+            return f"expected {expected} as in this run, found {found}"
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        pass
+    return "expected the file of a run, found none that can be read"
 
 
 def _json(content: Any) -> str:

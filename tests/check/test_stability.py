@@ -194,6 +194,20 @@ def test_a_denoiser_is_stable() -> None:
     assert {check.what for check in checks} == {"valid", "contained", "refused", "exposure"}
 
 
+def test_derivatives_of_a_denoiser_in_black_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "def root():\n    return lambda color: color.sqrt()\n\n"
+        "def safe():\n    return lambda color: color.where(color > 0, 1).sqrt().where(color > 0, 0)\n"
+    )
+    found = {}
+    for name in ("root", "safe"):
+        checks = [each for each in check_denoiser(f"{path}:{name}", (torch.float32,)) if each.what == "gradient"]
+        found[name] = {each.case for each in checks if not each.passed}
+        assert len(checks) > len(found[name])
+    assert found == {"root": {"uneven radiance", "radiance 0"}, "safe": set()}
+
+
 OWN = """
 def same():
     return lambda color: color

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from mcdenoise.data import files
-from mcdenoise.data.files import atomic_path, new_folder, write_json, write_text
+from mcdenoise.data.files import atomic_path, held, new_folder, write_json, write_text
 from mcdenoise.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and locks")
@@ -182,3 +182,14 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
 
     read = json.loads((tmp_path / "x.json").read_text(), parse_constant=refuse)
     assert read == {"a": [None, [None, 1.5]], "b": {"c": None}, "d": "NaN"}
+
+
+def test_the_lock_of_a_killed_process_is_taken_over_and_removed(tmp_path: Path) -> None:
+    (tmp_path / ".lock").write_text("process 1 of another machine at work in it")
+    with held(tmp_path, "training"):
+        assert str(os.getpid()) in (tmp_path / ".lock").read_text()
+        with pytest.raises(InputError, match="no other training"), held(tmp_path, "training"):
+            pass
+    assert not list(tmp_path.iterdir())
+    with held(tmp_path, "training"):
+        assert (tmp_path / ".lock").exists()

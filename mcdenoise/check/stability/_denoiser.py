@@ -22,6 +22,17 @@ from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN
 FRAMES = 3
 # The property of a denoiser that is checked on each shot of unusual values.
 VALID_SHOT = "valid"
+# Black, bright and even pixels, and some without albedo.
+UNEVEN = "uneven radiance"
+_DIFFERENTIATED = (
+    UNEVEN,
+    "radiance 0",
+    "radiance 65504",
+    "albedo 0",
+    "depth inf in some rows",
+    "motion inf in some rows",
+    "1x1",
+)
 _SIZE = (17, 23)
 _MIDDLE = (8, 11)
 _PROBE = 8
@@ -56,6 +67,8 @@ def _checks(model: str, dtype: torch.dtype) -> Iterator[Check]:
             yield _valid(denoiser, name, frames, dtype)
     if not buffers <= _frame(0, dtype).buffers:
         return
+    if dtype == torch.float32:
+        yield from _gradients(model, _shots(dtype))
     for value in (torch.nan, torch.inf, -1.0):
         yield _contained(denoiser, value, dtype)
     yield from (_refused(denoiser, name, dtype) for name in _REFUSED)
@@ -100,11 +113,18 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
         return changed
 
     some = slice(3, 9)
-    shots = {f"radiance {value:g}": with_value("color", value) for value in (0.0, 1e-40, 1e-30, 65504.0, 1e6, 1e30)}
+    uneven = []
+    for frame in frames:
+        color, albedo = frame.color.clone(), frame.albedo.clone()  # type: ignore[union-attr]
+        color[..., 2:5, 2:9], color[..., 6, 3], color[..., 9:12, 8:] = 0, limits.max**0.5, 0.5
+        albedo[..., 4:7, :] = 0
+        uneven.append(frame.replace(color=color, albedo=albedo))
+    shots = {UNEVEN: uneven}
+    shots |= {f"radiance {value:g}": with_value("color", value) for value in (0.0, 1e-40, 1e-30, 65504.0, 1e6, 1e30)}
     shots |= {
         f"color {value:g} in some rows": with_value("color", value, some) for value in (torch.nan, torch.inf, -1.0)
     }
-    shots |= {"no valid color": with_value("color", torch.nan)}
+    shots |= {"one row of valid color": with_value("color", torch.nan, slice(1, None))}
     shots |= {f"albedo {value:g}": with_value("albedo", value) for value in (0.0, 1e-8, 1.0, 1.9)}
     shots |= {
         f"depth {value:g} in some rows": with_value("depth", value, some) for value in (0.0, 1e-30, 1e10, torch.inf)
@@ -139,6 +159,27 @@ def _valid(denoiser: Denoiser, name: str, frames: list[Frame], dtype: torch.dtyp
         if not torch.isfinite(image).all() or not (image >= 0).all():
             message = message or f"frame {number}: NaN, infinite or negative pixels"
     return _found(name, dtype, VALID_SHOT, message)
+
+
+def _gradients(model: str, shots: dict[str, list[Frame]]) -> Iterator[Check]:
+    """Derivatives of the last image in all buffers of all frames are finite; no checks of a model that has none."""
+    denoiser = parse_method(model).denoiser(differentiable=True)
+    for name in _DIFFERENTIATED:
+        denoiser.reset()
+        leaves: list[Tensor] = []
+        try:
+            for frame in shots[name]:
+                given = {key: image.clone().requires_grad_() for key, image in frame.items()}
+                leaves += given.values()
+                image = denoiser(frame.replace(**given))
+        except InputError:
+            # A library without derivatives.
+            return
+        if not image.requires_grad:
+            return
+        found = torch.autograd.grad(image.sum(), leaves, allow_unused=True)
+        finite = all(bool(torch.isfinite(gradient).all()) for gradient in found if gradient is not None)
+        yield _found(name, torch.float32, "gradient", "" if finite else "a gradient is NaN or infinite")
 
 
 def _contained(denoiser: Denoiser, value: float, dtype: torch.dtype) -> Check:

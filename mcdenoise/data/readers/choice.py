@@ -9,9 +9,10 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.cameras import fit_camera
-from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, named, recognise, usual
+from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, is_luminance, named, recognise, usual
 from mcdenoise.data.readers.values import is_direction
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
@@ -21,6 +22,9 @@ MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
 # Number of values to compare at a time: 64 MiB.
 _AT_ONCE = 2**24
+# Rec. 709 to XYZ (ITU-R BT.709), and the largest difference of a converted color relative to the light of a pixel.
+_TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+_SAME_COLOR = 2e-3
 # Largest median difference of a depth from that of the positions, relative to it.
 _SAME_DEPTH = 0.01
 # Names that are longer than a single letter.
@@ -35,6 +39,7 @@ class Choice:
         layers: selected layer by buffer.
         reasons: reason by buffer, if the layer was not selected by its name.
         written: the layers that the result replaces: usually that of the color, and layers equal to it.
+        converted: those of them that hold the color in another color space, and the matrix ``(C, 3)`` to that.
         unused: layers that look like buffers but are not used.
         unknown: layers with unknown names.
         warnings: doubtful choices, one line each.
@@ -43,6 +48,7 @@ class Choice:
     layers: dict[str, Layer] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
     written: list[Layer] = field(default_factory=list)
+    converted: dict[Layer, Array] = field(default_factory=dict)
     unused: list[Layer] = field(default_factory=list)
     unknown: list[Layer] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -69,7 +75,8 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     strangers: list[Layer] = []
     for layer in layers:
         found = recognise(layer)
-        if found is not None and fits(found[0], layer):
+        # A single channel is a color only if there is no other.
+        if found is not None and fits(found[0], layer) and not (found[0] == "color" and len(layer.channels) == 1):
             candidates[found[0]].append((found[1], layer))
         else:
             strangers.append(layer)
@@ -102,6 +109,8 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     elif twins := _twins(color, own, read):
         choice.written += twins
         choice.reasons["color"] = f"the same as {', '.join(map(str, twins))}, which gets the result too"
+    choice.converted = _conversions(color, own, read)
+    choice.written += choice.converted
     used = {*choice.layers.values(), *choice.written}
     known = [layer for own in candidates.values() for _, layer in own]
     choice.unused = [layer for layer in [*known, *filter(is_about_a_buffer, strangers)] if layer not in used]
@@ -127,7 +136,7 @@ def parse_mapping(texts: Sequence[str]) -> dict[str, str]:
 
 
 def _is_letter(layer: Layer) -> bool:
-    return layer.anonymous and layer.is_color and _WORDS.search(layer.name) is None
+    return layer.anonymous and (layer.is_color or len(layer.channels) == 1) and _WORDS.search(layer.name) is None
 
 
 def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Layer:
@@ -152,8 +161,10 @@ def _color(
     if not candidates:
         # A single picture of unknown name is the noisy color.
         pictures = [layer for layer in strangers if layer.is_color]
-        if len(pictures) == 1:
-            return pictures[0]
+        single = [layer for layer in strangers if layer.components in (("",), ("v",)) or is_luminance(layer)]
+        for own in (pictures, [layer for layer in single if is_luminance(layer)], single):
+            if len(own) == 1 and (own is pictures or not pictures):
+                return own[0]
         found = ", ".join(str(layer) for layer in dict.fromkeys([*pictures, *layers][:12])) or "no layers of floats"
         raise InputError(
             f"{where}: expected noisy radiance, found {found}; give its file too, or name it with --map color=LAYER"
@@ -240,6 +251,24 @@ def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
         if not alike:
             break
     return alike
+
+
+def _conversions(color: Layer, strangers: Sequence[Layer], read: Read) -> dict[Layer, Array]:
+    """Layers with the color as XYZ or luminance, as Mitsuba's films write it beside the RGB of a nested integrator."""
+    own = [layer for layer in strangers if (layer.group, layer.part) == (color.group, color.part)]
+    matrices = {
+        layer: _TO_XYZ if len(layer.channels) > 1 else _TO_XYZ[1:2]
+        for layer in own
+        if layer.components[:3] == ("x", "y", "z") or is_luminance(layer)
+    }
+    if not matrices or not color.is_color:
+        return {}
+    light = read(color, _ALL)[..., :3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        expected = {layer: light @ matrix.T for layer, matrix in matrices.items()}
+        off = {layer: np.abs(read(layer, _ALL)[..., :3] - each) for layer, each in expected.items()}
+        near = {layer: each <= _SAME_COLOR * np.abs(light).sum(-1, keepdims=True) for layer, each in off.items()}
+    return {layer: matrices[layer] for layer, each in near.items() if light.any() and each.mean() > 1 - _SAME_COLOR}
 
 
 def _together(read: Read, layers: Sequence[Layer], rows: slice) -> list[Image]:

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import EXR_SUFFIXES, Part, read_channels, read_image_header
+from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import convert, fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import Split
-from mcdenoise.data.readers.layers import Layer
+from mcdenoise.data.readers.layers import GREY, Layer
 from mcdenoise.data.readers.lights import Light, is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
@@ -51,6 +51,7 @@ class RenderedFiles:
         color_has_albedo: whether the radiance includes the albedo.
         split: the layers of diffuse and specular light, if they add up to the color.
         samples: the layers of single samples, if their mean is the color.
+        window: the smallest window with the data windows of all colors, if there is one that differs from another.
     """
 
     groups: Sequence[FileGroup]
@@ -68,6 +69,7 @@ class RenderedFiles:
     drops_positions: bool = False
     split: Split | None = None
     samples: SampleLayers | None = None
+    window: Window | None = None
     table: list[Row] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     noise_seeds: int = 1
@@ -75,7 +77,7 @@ class RenderedFiles:
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
-        return self.part(self.choice.layers["color"]).size
+        return self.part(self.choice.layers["color"]).size if self.window is None else self.window.size
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -87,6 +89,8 @@ class RenderedFiles:
         }
         if len(self.choice.layers["color"].channels) > 3:
             present.add("alpha")
+        if self.window is not None:
+            present.add("mask")
         if "position" in present and (self.has_camera or self.cameras is not None):
             present |= {"view_projection", "depth"}
         elif self.cameras is not None:
@@ -212,12 +216,19 @@ class RenderedFiles:
         """Write the files of a frame with the denoised image; see :meth:`mcdenoise.data.Sequence.write`."""
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
-        added: dict[str, Image] = {}
+        inside: dict[tuple[int, str], Image] = {}
         if output_layer is not None:
-            names = [".".join((*layer.family, output_layer, letter)) for letter in "RGB"]
-            added = {name: image[..., i] for i, name in enumerate(names)}
+            grey = len(layer.channels) == 1
+            names = [".".join((*layer.family, output_layer, letter)) for letter in ("Y" if grey else "RGB")]
+            planes = image.mean(-1, keepdims=True) if grey else image
+            inside = {(layer.part, name): planes[..., i] for i, name in enumerate(names)}
         for each in self.choice.written if output_layer is None else ():
-            files[each.group] |= {(each.part, name): image[..., i] for i, name in enumerate(each.channels[:3])}
+            matrix = self.choice.converted.get(each)
+            if matrix is not None:
+                planes = (image @ matrix.T).astype(np.float32)
+            else:
+                planes = image.mean(-1, keepdims=True) if len(each.channels) == 1 else image
+            files[each.group] |= {(each.part, name): planes[..., i] for i, name in enumerate(each.channels[:3])}
         if alpha is not None:
             own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]
             files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
@@ -227,13 +238,21 @@ class RenderedFiles:
             source, ours = self.groups[group].files[number], group == layer.group
             target = out / source.name
             write_like(
-                *(source, target, files[group]),
-                added=added if ours else {},
+                *(source, target, self._cropped(source, files[group])),
+                added={key[1]: pixels for key, pixels in self._cropped(source, inside).items()} if ours else {},
                 part=layer.part,
                 like=layer.channels[0],
                 full_float=full_float,
+                stored=self.parts[group][0],
             )
         return out / self.file(layer, number).name
+
+    def _cropped(self, path: Path, channels: dict[tuple[int, str], Image]) -> dict[tuple[int, str], Image]:
+        """The pixels of channels in the data windows of a file."""
+        if self.window is None:
+            return channels
+        parts = read_image_header(path).parts
+        return {key: parts[key[0]].window.of(pixels, self.window) for key, pixels in channels.items()}
 
     def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[int, dict[tuple[int, str], Image]]:
         """For each kind of file, the channels of its layers of light for given denoised radiances."""
@@ -259,6 +278,10 @@ class RenderedFiles:
             images["mask"] = np.where((images["color"] > 0).any(-1, keepdims=True), 1, images["mask"] > 0).astype(
                 np.float32
             )
+        if self.window is not None:
+            own = self.window_of(self.choice.layers["color"], number)
+            inside = self.window.of(np.ones((*own.size, 1), np.float32), own)
+            images["mask"] = np.minimum(images.get("mask", inside), inside)
         seen = seen_of(images)
         if "albedo" in images:
             images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
@@ -310,6 +333,10 @@ class RenderedFiles:
         """The file that contains a layer of a frame."""
         return self.groups[layer.group].files[number]
 
+    def window_of(self, layer: Layer, number: int) -> Window:
+        """The data window of a layer in a frame."""
+        return read_image_header(self.file(layer, number)).parts[layer.part].window
+
     def read(self, number: int, layers: Mapping[str, Layer]) -> dict[str, Image]:
         """Read layers of one frame, opening each file once."""
         files: defaultdict[Path, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
@@ -322,6 +349,10 @@ class RenderedFiles:
             for name, layer in layers.items():
                 if self.file(layer, number) == path:
                     pixels = found[layer.part][..., [wanted[layer.part].index(c) for c in layer.channels]]
+                    if self.window is not None:
+                        # Nothing was hit there.
+                        fill = np.inf if name == "depth" else 0.0
+                        pixels = self.window.of(pixels, self.window_of(layer, number), fill)
                     images[name] = self._decoded(name, layer, pixels, path)
         if self.positions_of_camera and "position" in images:
             images["position"] = self.in_world(number, images["position"])
@@ -348,8 +379,10 @@ class RenderedFiles:
             )
         # Layers of light are not buffers.
         if self.part(layer).display_referred and (name in _LIGHT or name not in BUFFERS):
-            pixels = np.concatenate([decode(pixels[..., :3]), pixels[..., 3:]], -1)
+            pixels = np.concatenate([decode(pixels[..., :3], self.part(layer).gamma), pixels[..., 3:]], -1)
         channels = BUFFERS[name].channels if name in BUFFERS else 3
+        if name in GREY and pixels.shape[2] == 1:
+            return np.repeat(pixels, 3, -1)
         if name in ("color", "motion"):
             return pixels
         if name == "variance" and pixels.shape[2] < 3:

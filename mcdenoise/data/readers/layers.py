@@ -51,6 +51,9 @@ _ORDER = {
     for place, row in enumerate(("r red x u", "g green y v", "b blue z", "a alpha w"))
     for spelling in row.split()
 }
+# Buffers of three channels that may have one, and names of it.
+GREY = frozenset({"color", "reference"})
+_LUMINANCE = {"y", "l", "luminance", "grey", "gray"}
 _EYES = {"left", "right"}
 _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
 # A name with one of these words denotes a property of a buffer, not the buffer itself.
@@ -163,6 +166,13 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
     return found
 
 
+def is_luminance(layer: Layer) -> bool:
+    """Whether a layer is a single channel with the name of a luminance, or of a color."""
+    says = recognise(layer)
+    named_so = bool({layer.title.lower(), *layer.components} & _LUMINANCE)
+    return len(layer.channels) == 1 and (named_so or (says is not None and says[0] == "color"))
+
+
 def recognise(layer: Layer) -> tuple[str, int] | None:
     """The buffer that a layer's name denotes and the rank of the name (0 is the best), or ``None``.
 
@@ -215,7 +225,7 @@ def _split(name: str) -> list[str]:
 
 
 def fits(buffer: str, layer: Layer) -> bool:
-    """Whether a layer has the channels of a buffer; a single channel may be stored as grey."""
+    """Whether a layer has the channels of a buffer; a single channel may be stored as grey, and light as luminance."""
     count = len(layer.channels)
     if BUFFERS[buffer].channels == 1:
         # Falcor's depth has its derivative as a second channel.
@@ -224,7 +234,7 @@ def fits(buffer: str, layer: Layer) -> bool:
         return count in (2, 3, 4)
     if buffer == "variance":
         return count in (1, 3, 4)
-    return count in (3, 4)
+    return count in (3, 4) or (count == 1 and buffer in GREY)
 
 
 def named(layers: Sequence[Layer], text: str) -> list[Layer]:

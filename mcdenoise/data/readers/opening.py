@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
 from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import ImageHeader, Part, read_channels, read_image_header
+from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
 from mcdenoise.data.readers.cameras import FittedCamera, fit_camera, motion_to, read_as
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
@@ -44,6 +46,8 @@ from mcdenoise.data.readers.values import (
 from mcdenoise.errors import InputError
 from mcdenoise.noise import noise_is_spread
 
+# Color spaces of images that the user may state.
+ColorSpace: TypeAlias = Literal["auto", "linear", "srgb"]
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
 # Strips of rows, and the columns in them, in which layers are compared with the color.
@@ -64,6 +68,7 @@ def open_files(
     mapping: Mapping[str, str],
     color_has_albedo: bool | None = None,
     lights: Sequence[str] = (),
+    color_space: ColorSpace = "auto",
 ) -> RenderedFiles:
     """Open the files of a shot: determine their contents by names, headers, and values of the first frames.
 
@@ -74,6 +79,7 @@ def open_files(
         mapping: see :func:`mcdenoise.data.readers.choice.choose`.
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
         lights: names of additive layers of radiance that are denoised with the color.
+        color_space: that of images other than EXR; by default what the files say.
 
     Raises:
         InputError: the files cannot be recognised, do not match one another, or cannot be read.
@@ -94,7 +100,9 @@ def open_files(
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
-    shot = RenderedFiles(groups, [header.parts for header in headers], numbers, choice, {}, warnings=choice.warnings)
+    shot = RenderedFiles(
+        groups, [_parts(header, color_space) for header in headers], numbers, choice, {}, warnings=choice.warnings
+    )
     _check(shot)
     found, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
     folder = shot.file(color, numbers[0]).parent
@@ -109,6 +117,13 @@ def open_files(
     if not _FEATURES & {*choice.layers, *mapping}:
         _look_beside(shot)
     return shot
+
+
+def _parts(header: ImageHeader, color_space: ColorSpace) -> tuple[Part, ...]:
+    """The parts of a file, in another color space if that is stated."""
+    if header.format == "openexr" or color_space == "auto":
+        return header.parts
+    return tuple(replace(part, display_referred=color_space == "srgb", gamma=0.0) for part in header.parts)
 
 
 @dataclass(frozen=True)
@@ -131,7 +146,7 @@ class Result:
         return self.window.size
 
     def read(self, window: Window | None = None) -> tuple[Tensor, Metadata]:
-        """Read ``(1, 3, H, W)`` radiance, and the attributes of the file.
+        """Read ``(1, 3, H, W)`` radiance, thrice the same from one channel, and the attributes of the file.
 
         Args:
             window: what to read instead of the data window; 0 where that has no pixels.
@@ -140,6 +155,7 @@ class Result:
             InputError: the file is damaged.
         """
         pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
+        pixels = np.repeat(pixels, 3, -1) if pixels.shape[2] == 1 else pixels
         pixels = pixels if window is None else window.of(pixels, self.window)
         image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
         return image, read_image_header(self.path).metadata
@@ -163,7 +179,7 @@ def open_result(path: Path) -> Result:
 
 
 def _check(shot: RenderedFiles) -> None:
-    """Check that every frame has every buffer, with the same data window."""
+    """Check that every frame has every buffer, in the same display window; join data windows that differ."""
     color = shot.choice.layers["color"]
     main = shot.part(color)
     for name, layer in sorted(shot.choice.layers.items()):
@@ -175,18 +191,33 @@ def _check(shot: RenderedFiles) -> None:
                 f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
             )
         part = shot.part(layer)
-        if (part.size, part.origin) != (main.size, main.origin):
+        if part.window != main.window and part.display != main.display:
             raise InputError(
                 f"{next(iter(files.values()))}: expected '{name}' in the pixels of the color "
                 f"({_window(main)}), found {_window(part)}; render all layers in one window, or leave this one "
                 f"out with --map {name}="
             )
-    names = {layer: set(layer.channels) for layer in shot.choice.layers.values()}
+    layers = {*shot.choice.layers.values(), *shot.choice.written}
+    windows: list[Window] = []
+    written: list[Window] = []
+    kept = {color, *shot.choice.written}
     for group, own in enumerate(shot.groups):
-        used = [layer for layer in names if layer.group == group]
+        used = [layer for layer in layers if layer.group == group]
         for number in shot.numbers if used else []:
             if number in own.files:
-                _check_header(own.files[number], read_image_header(own.files[number]), used, main)
+                header = read_image_header(own.files[number])
+                _check_header(own.files[number], header, used, main)
+                windows += (header.parts[layer.part].window for layer in used)
+                written += (header.parts[layer.part].window for layer in used if layer in kept)
+    if len(set(windows)) > 1:
+        shot.window = functools.reduce(Window.joined, written)
+    reference = shot.choice.layers.get("reference", color)
+    for number in shot.reference_numbers:
+        if shot.window_of(reference, number) != shot.window_of(color, number):
+            raise InputError(
+                f"{shot.file(reference, number)}: expected a reference in the data window of the color, found another; "
+                "render it so, or leave it out with --map reference="
+            )
 
 
 def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main: Part) -> None:
@@ -198,10 +229,10 @@ def _check_header(path: Path, header: ImageHeader, layers: Sequence[Layer], main
                 "render all frames with the same layers"
             )
         part = header.parts[layer.part]
-        if (part.size, part.origin) != (main.size, main.origin):
+        if part.window != main.window and part.display != main.display:
             raise InputError(
-                f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; "
-                "render all buffers and frames at one size"
+                f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
+                "buffers and frames at one size, or crop them in one display window"
             )
 
 
@@ -279,7 +310,8 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     if shot.part(shot.choice.layers["color"]).display_referred:
         words.append("display values, made linear")
         shot.warnings.append(
-            "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats"
+            "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats, or say "
+            "--input-color-space linear if its numbers are linear"
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
     color = np.nan_to_num(images["color"][..., :3])
@@ -411,9 +443,9 @@ def _seen_elsewhere(
 def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
     """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
     color, number = shot.choice.layers["color"], shot.numbers[0]
-    height, width = shot.size
     main = shot.part(color)
-    same = [each for each in layers if (shot.part(each).size, shot.part(each).origin) == (main.size, main.origin)]
+    height, width = main.size
+    same = [each for each in layers if shot.part(each).window == main.window]
     wanted = list(dict.fromkeys(layer for layer in same if number in shot.groups[layer.group].files))
     found: dict[Layer, list[Image]] = {layer: [] for layer in wanted}
     for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int):
@@ -424,7 +456,9 @@ def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Im
             pixels = read_channels(shot.file(own[0], number), {key[1]: channels}, rows)[key[1]]
             for place, layer in enumerate(own):
                 image = pixels[:, :: max(1, width // _COLUMNS), 3 * place : 3 * place + 3].reshape(-1, 3)
-                found[layer].append(decode(image[None])[0] if shot.part(layer).display_referred else image)
+                found[layer].append(
+                    decode(image, shot.part(layer).gamma) if shot.part(layer).display_referred else image
+                )
     return {layer: np.concatenate(strips) for layer, strips in found.items() if strips}
 
 
@@ -515,7 +549,7 @@ def _look_at_samples(shot: RenderedFiles, samples: SampleLayers) -> None:
 
 def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
     """Whether all frames have these layers, with the data window of the color."""
-    main = shot.part(shot.choice.layers["color"])
+    color = shot.choice.layers["color"]
     for layer in set(layers):
         files = shot.groups[layer.group].files
         for number in shot.numbers:
@@ -523,7 +557,7 @@ def _is_everywhere(shot: RenderedFiles, layers: Collection[Layer]) -> bool:
             own = parts[layer.part] if layer.part < len(parts) else None
             if own is None or not {*layer.channels} <= {*own.channels}:
                 return False
-            if (own.size, own.origin) != (main.size, main.origin):
+            if own.window != read_image_header(shot.file(color, number)).parts[color.part].window:
                 return False
     return True
 

@@ -31,6 +31,7 @@ def write_like(
     part: int = 0,
     like: str = "",
     full_float: bool = False,
+    stored: Part | None = None,
 ) -> None:
     """Write a copy of ``source`` with the same container, parts, channels, types, attributes, windows, compression.
 
@@ -42,6 +43,7 @@ def write_like(
         part: the part that gets the new channels.
         like: the channel of that part whose type the new channels get.
         full_float: store all these channels as 32-bit floats, whatever the types were.
+        stored: the curve of a picture that is no EXR; by default what the file says.
 
     Raises:
         InputError: the file cannot be written, or a layer is to be added to a file that has none.
@@ -54,7 +56,7 @@ def write_like(
                 f"{source}: expected an EXR to add a layer to, found '{source.suffix}'; replace its picture"
             )
         else:
-            reason = _write_picture(source, temporary, {name: image for (_, name), image in replaced.items()})
+            reason = _write_picture(source, temporary, {name: image for (_, name), image in replaced.items()}, stored)
         if reason:
             raise InputError(
                 f"{target}: cannot be written ({reason}); check the folder, its permissions and free space"
@@ -144,13 +146,15 @@ def _stored(image: Image, kind: Any) -> Any:
     return np.ascontiguousarray(within_half(image) if kind == np.float16 else image, dtype=kind)
 
 
-def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image]) -> str:
+def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> str:
     """Write a file with one picture, with its other channels and its pixel type unchanged."""
     spec, part, pixels = read_picture(source)
-    light = np.stack([replaced[name] for name in part.channels[:3]], -1)
-    pixels[..., :3] = encode(light) if part.display_referred else light
-    if len(part.channels) > 3 and part.channels[3] in replaced:
-        pixels[..., 3] = replaced[part.channels[3]]
+    stored = stored or part
+    for place, name in enumerate(part.channels):
+        if name in replaced:
+            image = replaced[name]
+            display = stored.display_referred and name.lower() not in ("a", "alpha")
+            pixels[..., place] = encode(image[..., None], stored.gamma)[..., 0] if display else image
     output = oiio.ImageOutput.create(str(target))
     if output is None or not output.open(str(target), spec):
         return pending_error(output or oiio) or "writing failed"

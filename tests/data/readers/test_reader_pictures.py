@@ -1,0 +1,179 @@
+"""Pictures that are no EXR, and those of one channel: read in the color space that they state, and written in it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from mcdenoise.data import open_sequence
+
+Image = np.ndarray[Any, Any]
+SIZE = (12, 16)
+Run = Callable[..., tuple[int, str, str]]
+
+
+def picture(path: Path, kind: str, channels: int = 3, **attributes: Any) -> Image:
+    """Write random values, and return them as stored."""
+    pixels = np.random.default_rng(0).integers(1, 200, (*SIZE, channels)).astype(np.float32) / 255
+    spec = oiio.ImageSpec(SIZE[1], SIZE[0], channels, kind)
+    for name, value in attributes.items():
+        if name == "ICCProfile":
+            spec.attribute(name, oiio.TypeDesc(f"uint8[{len(value)}]"), value)
+        else:
+            spec.attribute(name.replace("__", ":"), value)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec), output.geterror()
+    assert output.write_image(pixels), output.geterror()
+    assert output.close()
+    return stored(path)
+
+
+def stored(path: Path) -> Image:
+    config = oiio.ImageSpec()
+    config.attribute("oiio:RawColor", 1)
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    file = oiio.ImageInput.open(str(path), config)
+    pixels = np.asarray(file.read_image("float")).reshape(*SIZE, -1)
+    assert str(file.spec().format) == str(file.spec().channelformat(0))
+    file.close()
+    return pixels
+
+
+def profile(curve: bytes) -> bytes:
+    """An ICC profile of display colors with this curve."""
+    tags = [(name, curve) for name in (b"rTRC", b"gTRC", b"bTRC")]
+    start = 128 + 4 + 12 * len(tags)
+    table = b"".join(struct.pack(">4sII", name, start, len(curve)) for name, _ in tags)
+    body = struct.pack(">I", len(tags)) + table + curve
+    head = struct.pack(">I4sI4s4s4s", 128 + len(body), b"none", 0x02400000, b"mntr", b"RGB ", b"XYZ ")
+    return head.ljust(36, b"\0") + b"acsp".ljust(92, b"\0") + body
+
+
+def srgb(values: Image) -> Image:
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+CURVES: dict[str, Callable[[Image], Image]] = {
+    "linear": lambda values: values,
+    "srgb": srgb,
+    "gamma": lambda values: values**2.2,
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "attributes", "option", "curve"),
+    [
+        ("a.png", "uint8", {}, "auto", "srgb"),
+        ("a.png", "uint16", {}, "auto", "srgb"),
+        ("a.png", "uint16", {}, "linear", "linear"),
+        ("a.png", "uint16", {"oiio__ColorSpace": "Linear"}, "auto", "linear"),
+        ("a.png", "uint16", {"oiio__ColorSpace": "Linear"}, "srgb", "srgb"),
+        ("a.png", "uint16", {"oiio__ColorSpace": "Gamma2.2"}, "auto", "gamma"),
+        ("a.png", "uint8", {"oiio__ColorSpace": "sRGB"}, "auto", "srgb"),
+        ("a.tif", "uint16", {}, "auto", "srgb"),
+        ("a.tif", "uint16", {}, "linear", "linear"),
+        ("a.tif", "float", {}, "auto", "linear"),
+        ("a.tif", "float", {}, "srgb", "srgb"),
+        ("a.tif", "uint16", {"ICCProfile": profile(struct.pack(">4sII", b"curv", 0, 0))}, "auto", "linear"),
+        ("a.tif", "uint16", {"ICCProfile": profile(struct.pack(">4sIIH", b"curv", 0, 1, 256))}, "auto", "linear"),
+        ("a.tif", "uint16", {"ICCProfile": profile(struct.pack(">4sIIH", b"curv", 0, 1, 563))}, "auto", "gamma"),
+        (
+            "a.tif",
+            "uint16",
+            {"ICCProfile": profile(struct.pack(">4sII3H", b"curv", 0, 3, 0, 9000, 65535))},
+            "auto",
+            "srgb",
+        ),
+        (
+            "a.tif",
+            "uint16",
+            {"ICCProfile": profile(struct.pack(">4sIHHi", b"para", 0, 0, 0, 1 << 16))},
+            "auto",
+            "linear",
+        ),
+        ("a.tif", "float", {"ICCProfile": profile(struct.pack(">4sIHHi", b"para", 0, 3, 0, 157286))}, "auto", "srgb"),
+        ("a.tif", "uint16", {"ICCProfile": b"damaged" * 30}, "auto", "srgb"),
+        ("a.pfm", "float", {}, "auto", "linear"),
+        ("a.hdr", "float", {}, "auto", "linear"),
+    ],
+)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_color_space_of_a_picture_is_kept(
+    name: str, kind: str, attributes: dict[str, Any], option: Any, curve: str, channels: int, tmp_path: Path
+) -> None:
+    if name == "a.hdr" and channels == 1:
+        return
+    before = picture(tmp_path / name, kind, channels, **attributes)
+    sequence = open_sequence(tmp_path / name, color_space=option)
+    color = sequence.frame(0).color[0].movedim(0, -1).numpy()
+    assert color.shape == (*SIZE, 3)
+    np.testing.assert_allclose(color, np.broadcast_to(CURVES[curve](before), color.shape), rtol=3e-3, atol=1e-5)
+    # Only display values are warned of.
+    assert any("brighter than white" in warning for warning in sequence.warnings) is (curve != "linear")
+    (tmp_path / "out").mkdir()
+    after = stored(sequence.write(tmp_path / "out", 0, color))
+    assert after.shape == before.shape
+    np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("names", ["Y", "Y A", "Y Z", "L", "grey.V", "beauty.Y depth.Z", "lightmap"])
+def test_one_channel_is_denoised_and_written_as_one(
+    names: str, run: Run, save: Callable[..., Path], tmp_path: Path
+) -> None:
+    random = np.random.default_rng(0)
+    channels = {name: np.ones(SIZE, np.float32) for name in names.split()}
+    first = next(iter(channels))
+    channels[first] = random.gamma(3, 1 / 6, SIZE).astype(np.float32)
+    path = save(tmp_path / "ao_0001.exr", channels)
+    status, _, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "oidn_tuned", "--threads", "1")
+    assert (status, errors) == (0, "")
+    after = oiio.ImageBuf(str(tmp_path / "out" / path.name))
+    assert list(after.spec().channelnames) == list(channels)
+    pixels = after.get_pixels("float")
+    found = pixels[..., list(channels).index(first)]
+    assert found.std() < 0.4 * channels[first].std()
+    assert found.mean() == pytest.approx(0.5, rel=0.1)
+    for place, name in enumerate(channels):
+        if name != first:
+            np.testing.assert_array_equal(pixels[..., place], channels[name])
+
+
+def test_a_single_channel_is_no_color_beside_a_picture(save: Callable[..., Path], tmp_path: Path) -> None:
+    channels = {name: np.full(SIZE, 0.5 + i / 10) for i, name in enumerate(["R", "G", "B", "Y", "noisy.V"])}
+    sequence = open_sequence(save(tmp_path / "a.exr", channels))
+    assert [float(each) for each in sequence.frame(0).color[0, :, 0, 0]] == pytest.approx([0.5, 0.6, 0.7])
+
+
+def test_both_color_spaces_are_one_too_many(run: Run, tmp_path: Path) -> None:
+    picture(tmp_path / "a.png", "uint8")
+    options = ("-o", tmp_path / "out", "--input-linear", "--input-color-space", "srgb")
+    status, _, errors = run("denoise", tmp_path / "a.png", *options)
+    assert status == 2
+    assert errors.count("\n") == 1
+
+
+@pytest.mark.parametrize("names", ["XYZ", "XYZA", "Y", "YA"])
+def test_the_color_in_another_space_is_written_too(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
+    """Mitsuba's films write XYZ or luminance beside the RGB of the nested integrator: never half of a file."""
+    to_xyz = np.array([[0.412453, 0.35758, 0.180423], [0.212671, 0.71516, 0.072169], [0.019334, 0.119193, 0.950227]])
+    color = np.random.default_rng(0).gamma(1, 1, (*SIZE, 3)).astype(np.float32)
+    light = color @ to_xyz.T
+    channels = {name: light[..., "XYZ".index(name)] for name in names.removesuffix("A")}
+    channels |= {f"image.{each}": color[..., i] for i, each in enumerate("RGB")}
+    channels |= {"A": np.full(SIZE, 0.5)} if names.endswith("A") else {}
+    channels |= {f"other.{each}": light[..., i] * 1.1 for i, each in enumerate("XYZ")}
+    sequence = open_sequence(save(tmp_path / "a.exr", channels))
+    np.testing.assert_allclose(sequence.frame(0).color[0].movedim(0, -1).numpy(), color, rtol=1e-6)
+    (tmp_path / "out").mkdir()
+    path = sequence.write(tmp_path / "out", 0, color * np.float32(0.5))
+    after = oiio.ImageBuf(str(path))
+    pixels = dict(zip(after.spec().channelnames, np.moveaxis(after.get_pixels("float"), -1, 0), strict=True))
+    for name, image in channels.items():
+        expected = image if name == "A" or name.startswith("other") else image * 0.5
+        np.testing.assert_allclose(pixels[name], expected, rtol=1e-5)

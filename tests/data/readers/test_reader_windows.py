@@ -1,0 +1,130 @@
+"""Data windows that differ between frames or parts of one display window."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from mcdenoise import Denoiser
+from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
+from mcdenoise.folder import denoise_sequence
+
+Image = np.ndarray[Any, Any]
+DISPLAY = (40, 64)
+
+
+def part(channels: dict[str, Image], top: int, left: int, name: str = "", display: tuple[int, int] = DISPLAY) -> Any:
+    height, width = next(iter(channels.values())).shape
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "dataWindow": (np.int32([left, top]), np.int32([left + width - 1, top + height - 1])),
+        "displayWindow": (np.int32([0, 0]), np.int32([display[1] - 1, display[0] - 1])),
+        **({"name": name} if name else {}),
+    }
+    return OpenEXR.Part(header, {key: np.ascontiguousarray(value) for key, value in channels.items()}, name)
+
+
+def radiance(height: int, width: int, seed: int) -> dict[str, Image]:
+    pixels = np.random.default_rng(seed).gamma(2, 0.2, (3, height, width)).astype(np.float32)
+    return dict(zip("RGB", pixels, strict=True))
+
+
+def stored(path: Path) -> list[tuple[tuple[int, int], dict[str, Image]]]:
+    """First row and column, and channels, of each part."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return [
+            (tuple(each.header["dataWindow"][0][::-1].tolist()), {n: c.pixels for n, c in each.channels.items()})
+            for each in file.parts
+        ]
+
+
+WINDOWS = [(4, 5, 20, 30), (6, 9, 24, 28), (0, 30, 10, 34)]
+
+
+@pytest.fixture
+def cropped(tmp_path: Path) -> Path:
+    """Frames that the renderer has cropped to what they show, as (top, left, height, width)."""
+    (tmp_path / "in").mkdir()
+    for number, (top, left, height, width) in enumerate(WINDOWS):
+        channels = radiance(height, width, number) | {"Z": np.full((height, width), 2 + number, np.float32)}
+        OpenEXR.File([part(channels, top, left)]).write(str(tmp_path / f"in/shot_{number:04d}.exr"))
+    return tmp_path / "in"
+
+
+def test_frames_share_the_window_of_all_and_void_pixels_are_masked(cropped: Path) -> None:
+    sequence = open_sequence(cropped)
+    # Rows 0 to 30, columns 5 to 64.
+    assert sequence.size == (30, 59)
+    assert "mask" in sequence.buffers
+    for number, (top, left, height, width) in enumerate(WINDOWS):
+        frame = sequence.frame(number)
+        frame.validate()
+        inside = np.zeros((30, 59), bool)
+        inside[top : top + height, left - 5 : left - 5 + width] = True
+        assert frame.mask is not None
+        assert frame.depth is not None
+        np.testing.assert_array_equal(frame.mask[0, 0].numpy() > 0, inside)
+        np.testing.assert_array_equal(frame.depth[0, 0].numpy(), np.where(inside, 2 + number, np.inf))
+        expected = np.stack(list(radiance(height, width, number).values()))
+        np.testing.assert_array_equal(frame.color[0].numpy()[:, inside], expected.reshape(3, -1))
+
+
+@pytest.mark.parametrize("options", [{}, {"output_layer": "clean"}])
+def test_each_file_is_written_in_its_own_window(cropped: Path, tmp_path: Path, options: dict[str, str]) -> None:
+    denoise_sequence(open_sequence(cropped), tmp_path / "out", Denoiser("noisy"), "noisy", **options)
+    for path in sorted(cropped.iterdir()):
+        ((before, old),), ((after, new),) = stored(path), stored(tmp_path / "out" / path.name)
+        assert before == after
+        for name in "RGBZ":
+            np.testing.assert_array_equal(old[name], new[name])
+        for name in "RGB" if options else "":
+            np.testing.assert_array_equal(old[name], new[f"clean.{name}"])
+
+
+def test_void_pixels_give_no_light_and_take_none(cropped: Path, tmp_path: Path) -> None:
+    for number, (top, left, height, width) in enumerate(WINDOWS):
+        flat = {name: np.full((height, width), 0.5, np.float32) for name in "RGB"}
+        OpenEXR.File([part(flat, top, left)]).write(str(cropped / f"shot_{number:04d}.exr"))
+    denoise_sequence(open_sequence(cropped), tmp_path / "out", Denoiser("joint_bilateral"), "joint_bilateral")
+    for path in (tmp_path / "out").glob("*.exr"):
+        ((_, channels),) = stored(path)
+        for name in "RGB":
+            np.testing.assert_allclose(channels[name], 0.5, rtol=1e-3)
+
+
+def test_a_cropped_feature_is_placed_where_it_belongs(tmp_path: Path) -> None:
+    albedo = {f"albedo.{name}": np.full((10, 12), 0.25, np.float32) for name in "RGB"}
+    path = tmp_path / "shot.exr"
+    OpenEXR.File([part(radiance(*DISPLAY, 0), 0, 0, "rgba"), part(albedo, 8, 20, "albedo")]).write(str(path))
+    sequence = open_sequence(path)
+    frame = sequence.frame(sequence.numbers[0])
+    expected = np.zeros(DISPLAY, np.float32)
+    expected[8:18, 20:32] = 0.25
+    assert frame.albedo is not None
+    np.testing.assert_array_equal(frame.albedo[0, 0].numpy(), expected)
+    assert frame.mask is not None
+    assert bool((frame.mask == 1).all())
+    denoise_sequence(sequence, tmp_path / "out", Denoiser("noisy"), "noisy")
+    for (before, old), (after, new) in zip(stored(path), stored(tmp_path / "out/shot.exr"), strict=True):
+        assert before == after
+        assert all(np.array_equal(old[name], new[name]) for name in old)
+
+
+def test_another_display_window_is_refused(cropped: Path) -> None:
+    other = part(radiance(20, 30, 0) | {"Z": np.ones((20, 30), np.float32)}, 4, 6, display=(80, 128))
+    OpenEXR.File([other]).write(str(cropped / "shot_0001.exr"))
+    with pytest.raises(InputError, match=r"shot_0001\.exr"):
+        open_sequence(cropped)
+
+
+def test_a_cropped_reference_is_refused(tmp_path: Path) -> None:
+    OpenEXR.File([part(radiance(*DISPLAY, 0), 0, 0)]).write(str(tmp_path / "shot_0001.exr"))
+    OpenEXR.File([part(radiance(10, 12, 0), 8, 20)]).write(str(tmp_path / "reference_0001.exr"))
+    with pytest.raises(InputError, match=r"reference_0001\.exr"):
+        open_sequence(tmp_path)
