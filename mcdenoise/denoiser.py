@@ -53,6 +53,7 @@ from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapper import name_of
+from mcdenoise.motion import MOTION_PAIRS, Seen, doubt_motion, seen_in
 from mcdenoise.noise import noise_is_repeated, noise_of, thinned
 from mcdenoise.sampling import has_exact_features
 
@@ -147,6 +148,9 @@ class FrameReport(Journal):
 
 class Denoiser:
     """Denoises the frames of a shot one after the other, and keeps the method's state.
+
+    The motion of the first frames of a shot is examined, on a CPU: a warning tells the likely mistake if another
+    convention fits the frames clearly better.
 
     Denoisers in several threads do not affect one another. Frames that several threads give to one denoiser are
     denoised one after the other, as one shot in the order of their arrival; ``report`` is that of the last of them.
@@ -327,6 +331,9 @@ class Denoiser:
         # The state that the last frame continued, and a few of its pixels.
         self._before: State = None
         self._seen: Frame | None = None
+        # What the next frame's motion is compared with, and how many frames are still examined.
+        self._compared: Seen | None = None
+        self._unseen = 1 + MOTION_PAIRS
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
@@ -437,6 +444,8 @@ class Denoiser:
                 if self.model is None:
                     self.pick(frame)
                 report.model = self._picked
+                # A depth by way of the camera says nothing about this camera.
+                compared = self._examined(frame.replace(depth=frame.depth if given.depth is not None else None))
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 precision, report.tiles = self._planned(frame, report)
@@ -460,6 +469,7 @@ class Denoiser:
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
         self._before, self._seen = (None, None) if seen is None else (before, seen)
+        self._compared, self._unseen = compared, max(self._unseen - 1, 0)
         return result
 
     def _prepared(self, frame: Frame, report: FrameReport) -> tuple[Frame, Void]:
@@ -497,6 +507,20 @@ class Denoiser:
         report.repeats = "the noise is that of the frame before, pixel by pixel; render each frame with its own seed"
         self._doubt(report.repeats)
         return self._before, seen
+
+    def _examined(self, frame: Frame) -> Seen | None:
+        """Warn of wrong motion in one of the first frames of a shot, and return what that of the next one needs.
+
+        Nothing is examined on a GPU, which would have to be waited for, nor for a method that uses no motion.
+        """
+        wanted = MOTION & (self.model.needs.buffers | self.model.needs.uses)
+        if not (self._unseen and self.warns and wanted and self.has_history(frame.buffers) and at_hand(self.device)):
+            return None
+        if not (doubt := doubt_motion(frame, self._compared)):
+            return seen_in(frame)
+        self._unseen = 0
+        warnings.warn(doubt, stacklevel=level_of_caller())
+        return None
 
     def _doubt(self, text: str) -> None:
         """Warn of changed light or equal noise, once a shot."""

@@ -30,25 +30,15 @@ from mcdenoise.data.exr import (
 )
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.cameras import convert, read_as
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS, adds_up, off
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.names import find_files
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.samples import mean_is, split_samples, write_samples
-from mcdenoise.data.readers.values import (
-    MOTION_PAIRS,
-    USUAL_MOTION,
-    Convention,
-    Pair,
-    Row,
-    normal_is_encoded,
-    nothing_hit,
-    read_motion,
-    read_radiance,
-)
+from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
+from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Convention, Pair, convert, read_as, read_motion
 
 # File names of the buffers in writing order: color is last, so that a frame that has its color is complete.
 _STEMS = {

@@ -16,7 +16,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_channels, read_image_header
-from mcdenoise.data.readers.cameras import convert, fit_camera
+from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import Split
 from mcdenoise.data.readers.layers import GREY, Layer
@@ -25,9 +25,10 @@ from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.samples import SampleLayers
 from mcdenoise.data.readers.transfer import decode
-from mcdenoise.data.readers.values import USUAL_MOTION, Convention, Row, nothing_hit
+from mcdenoise.data.readers.values import Row, nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
+from mcdenoise.motion import USUAL_MOTION, Convention, convert
 
 # Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}

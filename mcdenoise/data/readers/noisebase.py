@@ -24,11 +24,11 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Mask, Metadata, write_exr
-from mcdenoise.data.readers.cameras import miss
 from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.motion import miss
 
 SUFFIX = ".zip"
 # Channels and dtypes of the arrays. The arrays of a frame are [C, H, W, S], or [C, H, W] for the reference.

@@ -16,7 +16,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
-from mcdenoise.data.readers.cameras import FittedCamera, fit_camera, motion_to, read_as
+from mcdenoise.data.readers.cameras import FittedCamera, fit_camera
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
@@ -33,17 +33,9 @@ from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, mean_is, split_samples
 from mcdenoise.data.readers.transfer import decode
-from mcdenoise.data.readers.values import (
-    MOTION_PAIRS,
-    USUAL_MOTION,
-    Convention,
-    Row,
-    normal_is_encoded,
-    nothing_hit,
-    read_motion,
-    read_radiance,
-)
+from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
 from mcdenoise.errors import InputError
+from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Convention, motion_to, read_as, read_motion
 from mcdenoise.noise import noise_is_spread
 
 # Color spaces of images that the user may state.

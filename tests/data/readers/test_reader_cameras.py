@@ -12,7 +12,8 @@ import pytest
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.data.images import read_channels
-from mcdenoise.data.readers.cameras import convert, fit_camera, miss, motion_to, read_as
+from mcdenoise.data.readers.cameras import fit_camera
+from mcdenoise.motion import convert, miss, motion_to, read_as
 
 Array = np.ndarray[Any, Any]
 HEIGHT, WIDTH = 54, 96

@@ -13,18 +13,14 @@ from kornia.filters import gaussian_blur2d
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.values import (
-    USUAL_MOTION,
-    Convention,
     albedo_included,
     albedo_included_as_in,
-    conventions,
     is_direction,
-    match_cameras,
-    match_motion,
     normal_is_encoded,
     nothing_hit,
     read_radiance,
 )
+from mcdenoise.motion import USUAL_MOTION, Convention, conventions, match_cameras, match_motion
 
 Image = np.ndarray[Any, Any]
 HEIGHT, WIDTH = 96, 160
