@@ -259,6 +259,7 @@ def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPa
         raise ImportError("gone")
 
     monkeypatch.setattr(_backend.importlib, "import_module", gone)
+    monkeypatch.setitem(_backend._FOUND, "numba", True)
     _backend._tried_import.cache_clear()
     # It is there and fails, as with too little memory: said once, and then the reference runs.
     with (
