@@ -15,7 +15,6 @@ from torch import Tensor
 from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
-from mcdenoise.denoiser import Denoiser
 from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
@@ -30,6 +29,13 @@ FRAMES = 16
 SIZE = (320, 180)
 REFERENCE_SPP = 128
 REFERENCE_FRAMES = (14, 15)
+# Open Image Denoise in the setting that has the smallest errors on sequences, see docs/results.md.
+PEER = "oidn(quality=high, auxiliary=clean, source=accumulated after)"
+# Beside the baselines and the chosen model: filters, Open Image Denoise, and models with shipped weights.
+COMPARED = (
+    f"{PEER},oidn(quality=high, auxiliary=clean, source=raw),joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,"
+    "cascaded_v2,cascaded_v2_small,cascaded_v2_micro,oidn_tuned,oidn_tuned_exact"
+)
 # The close-ups of the picture: left, top, width and height as fractions of the image.
 _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
 
@@ -42,10 +48,10 @@ class DemoResult:
         scores: errors of the noisy and the accumulated image, those on the way and the result, over the frames with
             references.
         report: run times by stage, and what was done.
-        picture: noisy, accumulated, by Open Image Denoise where that is installed, denoised and reference side by side,
-            with close-ups.
+        picture: noisy, accumulated, by Open Image Denoise in its best setting where that is installed, denoised and
+            reference side by side, with close-ups.
         denoised: folder of the clean EXRs.
-        page: the report of error against run time of all methods.
+        page: the report of error against run time of a dozen methods.
     """
 
     scores: list[Score]
@@ -95,10 +101,11 @@ def run_demo(
         progress=on_render,
     )
     sequence = open_sequence(out / "sequence")
-    last: list[tuple[Frame, Output]] = []
+    peer = parse_method(PEER).denoiser() if find_model("oidn").installed else None
+    last: list[tuple[Frame, Output, Tensor | None]] = []
 
     def show(frame: Frame, output: Output) -> None:
-        last[:] = [(frame, output)]
+        last[:] = [(frame, output, peer(frame) if peer else None)]
         on_frame()
 
     report = denoise_sequence(sequence, out / "denoised", denoiser, spelling.name, references=True, on_output=show)
@@ -111,7 +118,7 @@ def run_demo(
 
 
 def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tuple[Path, list[Score]]:
-    """All methods on the frames of the demonstration; the folder of the results, and the errors."""
+    """A dozen methods on the frames of the demonstration; the folder of the results, and the errors."""
     folder, threads = out / "report", torch.get_num_threads()
     if (folder / FILE).exists():
         shutil.rmtree(folder)
@@ -123,27 +130,20 @@ def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tupl
         command=f"mcdenoise demo -o {shlex.quote(str(out))} --model {shlex.quote(model)}",
     )
     sequence = replace(open_sequence(out / "sequence"), name="demo")
-    methods = choose_methods(baselines=(*BASELINES, model))
+    methods = choose_methods(COMPARED, precisions="float32", baselines=(*BASELINES, model))
     return folder, scores_of(run_benchmark([sequence], methods, folder, settings, on_step=on_step))
 
 
-def _sheet(frame: Frame, output: Output) -> Picture:
+def _sheet(frame: Frame, output: Output, peer: Tensor | None) -> Picture:
     """A frame several times side by side, and under each image a close-up."""
     shown = {
         "1 sample a pixel": frame.color,
         "accumulated": output.stages.get("accumulated"),
-        "Open Image Denoise": _peer(frame),
+        "Open Image Denoise": peer,
         "mcdenoise": output.image,
         f"reference, {REFERENCE_SPP} samples": frame.reference,
     }
     return np.concatenate([_column(text, image) for text, image in shown.items() if image is not None], 1)
-
-
-def _peer(frame: Frame) -> Tensor | None:
-    """The frame by Open Image Denoise, in its best quality, where its package is installed."""
-    if not find_model("oidn").installed:
-        return None
-    return Denoiser("oidn", quality="high", auxiliary="clean")(frame)
 
 
 def _column(text: str, image: Tensor) -> Picture:

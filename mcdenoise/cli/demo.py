@@ -18,7 +18,7 @@ from mcdenoise.models import DEFAULT
 def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> None:
     """Render 16 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
-    Then compare the error and the run time of all models, filters and installed denoisers in a report.
+    Then compare the error and the run time of a dozen models, filters and installed denoisers in a report.
 
     Args:
         out: folder to write to; frames that an earlier run rendered there are reused.
