@@ -20,6 +20,23 @@ HEIGHT, WIDTH, FRAMES = 20, 24, 4
 os.environ["MCDENOISE_PRECISION"] = "float32"
 
 
+# Models that differ from the smallest of their family by their sizes, in tests of every model: those show as much.
+LARGER = (
+    *("cascaded_v2_small", "cascaded_v2_tiny", "cascaded_v3", "cascaded_v3_small", "cascaded_v3_tiny"),
+    *("oidn_tuned", "oidn_tuned_exact", "pyramid", "pyramid_small"),
+)
+OF_EVERY_MODEL = ("bad_input", "defaults", "device_reads", "export", "layers", "models", "pieces")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the larger members of a family as slow."""
+    for item in items:
+        given = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        larger = any(str(given.get(key)) in LARGER for key in ("name", "model"))
+        if larger and item.path.stem.removeprefix("test_") in OF_EVERY_MODEL:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session")
 def colour() -> Any:
     """The package colour-science."""
