@@ -91,8 +91,15 @@ def denoise(
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
     absent = {name for done in report.frames.values() for name in done.missing}
-    if missing := sorted(absent - (MOTION if len(opened) == 1 else frozenset())):
+    if (missing := sorted(absent - (MOTION if len(opened) == 1 else frozenset()))) and {
+        "albedo",
+        "normal",
+        "depth",
+    } & opened.buffers:
         say(f"without {', '.join(missing)}, with which {report.model} is better")
+    if not {"albedo", "normal", "depth"} & opened.buffers:
+        # Said last but for warnings, where it is seen.
+        say("NO FEATURES: turn on the passes albedo, normal and depth in the renderer; with them it is far better")
     warn(report.warnings)
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"

@@ -83,7 +83,7 @@ def completed(frame: Frame, output: Output) -> Output:
     alpha = output.alpha
     if alpha is None and alpha_of(frame) is not None:
         alpha = frame.alpha
-        _note_once("alpha", "kept: the method has no kernels")
+        _note_once("alpha", "unchanged: the method has no kernels")
     if not frame.layers:
         return output._replace(alpha=alpha)
     parts = output.layers

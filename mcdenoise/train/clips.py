@@ -284,7 +284,10 @@ def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop:
         raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
     for size in sizes:
         if min(size) < crop:
-            raise InputError(f"training clips: expected images of at least {crop} pixels, found {size}")
+            raise InputError(
+                f"training clips: expected images of at least {crop} pixels, found {size}; "
+                "choose a smaller --crop, a multiple of 32, or larger images"
+            )
 
 
 @dataclass(frozen=True)

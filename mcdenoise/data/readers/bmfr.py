@@ -30,6 +30,7 @@ from mcdenoise.data.exr import (
 )
 from mcdenoise.data.files import write_text
 from mcdenoise.data.images import read_channels, read_image_header
+from mcdenoise.data.readers.cameras import fault
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS, adds_up, off
 from mcdenoise.data.readers.layers import layers_of
 from mcdenoise.data.readers.names import find_files
@@ -361,14 +362,16 @@ def _look(folder: BmfrFolder, stated: bool | None) -> BmfrFolder:
         seen = (position != 0).any(-1)
         if "normal" in images:
             seen &= (images["normal"] != 0).any(-1)
-        convention, error = read_as(cameras.view_projection(number, folder.size), position, seen)
+        stated_matrix = cameras.view_projection(number, folder.size)
+        convention, error = read_as(stated_matrix, position, seen)
         words["view_projection"] = (
             f"{convention or 'row vectors, y down'}: positions are seen {error:.2g} pixels from their own"
         )
         if convention == "unknown":
+            seen = f"its cameras see the positions {error:.0f} pixels from their own, whichever way they are read"
             warnings.append(
-                f"{MATRICES}: its cameras see the positions {error:.0f} pixels from their own, whichever way they are "
-                "read, so no history is found; write the matrices of these frames"
+                f"{MATRICES}, frame {number}: {fault(stated_matrix) or seen}, so no history is found; "
+                "write the matrices of these frames"
             )
         elif convention:
             warnings.append(f"{MATRICES}: read as {convention}, since only so it sees the positions at their pixels")

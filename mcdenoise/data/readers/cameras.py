@@ -80,3 +80,13 @@ def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
         return None
     eye = -np.linalg.lstsq(matrix[:3].T, matrix[3], rcond=None)[0]
     return FittedCamera(matrix[:, [0, 1, 2, 2]], error, eye)
+
+
+def fault(matrix: Array) -> str:
+    """Why no camera has this matrix, in words: it is not finite, all zeros, or singular; empty if one may have it."""
+    if not np.isfinite(matrix).all():
+        return "the matrix has numbers that are not finite"
+    if not matrix.any():
+        return "the matrix is all zeros"
+    # Depth between the planes of clipping is of no use here.
+    return "the matrix is singular" if np.linalg.matrix_rank(matrix[:, [0, 1, 3]]) < 3 else ""

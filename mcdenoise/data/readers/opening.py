@@ -16,7 +16,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import MATRICES, Array, find_camera_matrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
-from mcdenoise.data.readers.cameras import FittedCamera, fit_camera
+from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
@@ -338,9 +338,10 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
             if shot.camera_convention:
                 shot.warnings.append(f"{MATRICES}: read as {how}, since only so it sees the positions at their pixels")
             return
+        seen = f"does not see the positions at their pixels (they miss by {error:.0f}) whichever way it is read"
         shot.warnings.append(
-            f"{MATRICES}: does not see the positions at their pixels (they miss by {error:.0f}) whichever way it is "
-            "read; cameras are found from the positions instead"
+            f"{MATRICES}, frame {shot.numbers[0]}: {fault(stated) or seen}; cameras are found from the "
+            "positions instead"
         )
         shot.cameras = None
     found = fit_camera(position, known)
@@ -349,6 +350,11 @@ def _look_at_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
         readings["position"].append("not used without a camera")
         readings.pop("view_projection")
         shot.drops_positions = True
+        if len(shot.numbers) > 1:
+            shot.warnings.append(
+                f"'position': no pinhole camera sees them at their pixels, and there is no {MATRICES}: not used; write "
+                "that file, or motion"
+            )
     elif not shot.positions_of_camera and _is_origin(found, position, known) and _ends_at_origin(shot):
         if world_to_camera(shot.metadata(shot.numbers[0])) is not None:
             shot.positions_of_camera = True

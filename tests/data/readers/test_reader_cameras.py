@@ -12,7 +12,7 @@ import pytest
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.data.images import read_channels
-from mcdenoise.data.readers.cameras import fit_camera
+from mcdenoise.data.readers.cameras import fault, fit_camera
 from mcdenoise.motion import convert, miss, motion_to, read_as
 
 Array = np.ndarray[Any, Any]
@@ -254,3 +254,21 @@ def test_matrices_of_something_else_are_told(small_sequence: Path) -> None:
     (warning,) = open_sequence(small_sequence).warnings
     assert "camera_matrices.h" in warning
     assert "whichever way they are read" in warning
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason"),
+    [
+        (np.zeros((4, 4)), "zeros"),
+        (np.ones((4, 4)), "singular"),
+        (np.diag([1.0, 0, 1, 1]), "singular"),
+        (np.full((4, 4), np.inf), "not finite"),
+        (np.eye(4), ""),
+        # No depth between planes of clipping.
+        (np.diag([1.0, 1, 0, 1]), ""),
+    ],
+)
+def test_a_matrix_that_no_camera_has_is_told_why(matrix: Any, reason: str) -> None:
+    found = fault(matrix)
+    assert reason in found
+    assert bool(found) is bool(reason)

@@ -131,8 +131,11 @@ def test_one_channel_is_denoised_and_written_as_one(
     first = next(iter(channels))
     channels[first] = random.gamma(3, 1 / 6, SIZE).astype(np.float32)
     path = save(tmp_path / "ao_0001.exr", channels)
-    status, _, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "oidn_tuned", "--threads", "1")
+    status, text, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "oidn_tuned", "--threads", "1")
     assert (status, errors) == (0, "")
+    # One loud line says what is missing.
+    assert text.count("NO FEATURES") == ("Z" not in names)
+    assert ("without albedo" in text) is ("Z" in names)
     after = oiio.ImageBuf(str(tmp_path / "out" / path.name))
     assert list(after.spec().channelnames) == list(channels)
     pixels = after.get_pixels("float")
