@@ -52,6 +52,7 @@ from mcdenoise.models._reads import at_hand
 from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
+from mcdenoise.models._wrapped import seam, unwrapped, wrapped
 from mcdenoise.models._wrapper import name_of
 from mcdenoise.motion import MOTION_PAIRS, Seen, doubt_motion, seen_in
 from mcdenoise.noise import noise_is_repeated, noise_of, thinned
@@ -187,6 +188,9 @@ class Denoiser:
             weights are, too.
         alpha: also denoise the alpha of frames, with the kernels of the color; a method without kernels keeps it, and
             the report says so. The color stays a pair with it, also at the rim of what it covers.
+        wrap: frames are panoramas of 360 degrees: the image continues at its left and right border with the other one,
+            so that there is no seam. Cameras are not used, as a matrix describes no panorama; the motion of a pixel may
+            lead over the border.
         settings: arguments for the model's constructor, such as ``alpha_min=0.2``; see the model's own page.
 
     Raises:
@@ -214,18 +218,24 @@ class Denoiser:
         max_memory: float | None = None,
         differentiable: bool = False,
         alpha: bool = False,
+        wrap: bool = False,
         **settings: Any,
     ) -> None:
         _check_kind("weights", weights, (str, Path, NoneType), "a path")
         _check_kind("tile", tile, (int, NoneType), "a whole number of pixels")
         _check_kind("max_memory", max_memory, (int, float, NoneType), "a number of GB")
-        for name, switch in (("keep_all", keep_all), ("differentiable", differentiable), ("alpha", alpha)):
+        for name, switch in (
+            ("keep_all", keep_all),
+            ("differentiable", differentiable),
+            ("alpha", alpha),
+            ("wrap", wrap),
+        ):
             _check_kind(name, switch, (bool,), "True or False")
         self.device = _device(device)
         known = get_args(AskedPrecision)
         if precision not in known:
             raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
-        self.keep_all, self.differentiable, self.alpha = keep_all, differentiable, alpha
+        self.keep_all, self.differentiable, self.alpha, self.wrap = keep_all, differentiable, alpha, wrap
         self._picked = ""
         self._asked, self._given, self._limits = precision, settings, (tile, max_memory)
         if model is None and weights is not None:
@@ -351,6 +361,7 @@ class Denoiser:
             streaming = self.has_history(buffers)
             # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
+            size = (size[0], size[1] + 2 * seam(size[1])) if self.wrap else size
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
             shot = shot._replace(bfloat16=self.precision != "float32")
             with torch.set_grad_enabled(self.differentiable):
@@ -440,6 +451,7 @@ class Denoiser:
                     alpha=self.alpha,
                 )
                 whole = frame.to(self.device).to(dtype).replace(hints=hints)
+                whole = wrapped(whole) if self.wrap else whole
                 frame, void = self._prepared(whole, report)
                 if self.model is None:
                     self.pick(frame)
@@ -464,6 +476,7 @@ class Denoiser:
                     output = output._replace(stages={"noisy": noisy, **output.stages})
                 output = completed(frame, output._replace(image=output.image.to(dtype)))
                 output = with_void(output, whole, void)
+                output = unwrapped(output, given.size[1]) if self.wrap else output
                 result: Output = owned(opened(output), [given, noisy, state])
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1

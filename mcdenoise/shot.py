@@ -51,6 +51,7 @@ class ShotSettings:
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
             patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
         alpha: also denoise the alpha with the same kernels; otherwise it is not changed.
+        wrap: the frames are panoramas of 360 degrees, whose left and right borders are one; cameras are not used.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: discard history where the light has changed.
         full_float: write the result as 32-bit floats, even where it was stored as half floats.
@@ -87,6 +88,7 @@ class ShotSettings:
     output_layer: str | None = None
     layers: tuple[str, ...] = ()
     alpha: bool = False
+    wrap: bool = False
     alpha_min: float | None = None
     anti_lag: bool = True
     full_float: bool = False
@@ -223,6 +225,7 @@ class ShotSettings:
             tile=self.tile,
             max_memory=self.max_memory,
             alpha=self.alpha,
+            wrap=self.wrap,
             **{name: value for name, value in asked.items() if value is not None},
         )
 
