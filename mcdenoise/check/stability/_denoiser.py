@@ -138,6 +138,10 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {f"{h}x{w}": [_frame(seed, dtype, (h, w)) for seed in range(FRAMES)] for h, w in ((1, 1), (1, 9), (9, 1))}
     shots |= {"nothing but color": [Frame(color=frame.color) for frame in frames]}
     # Features that contradict each other, or are missing in some frames.
+    void = torch.ones_like(frames[0].color[:, :1])
+    void[:, :, some] = 0
+    shots |= {"mask 0 in some rows": [frame.replace(mask=void) for frame in frames]}
+    shots |= {"void rows": [frame.replace(color=frame.color * void, alpha=void) for frame in frames]}
     shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
     shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
     shots |= {"normal -1": with_value("normal", -1.0)}
