@@ -98,6 +98,7 @@ def test_the_composed_example_does_what_is_promised(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_the_composed_example_is_exported_and_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_composed(tmp_path)
