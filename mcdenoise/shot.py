@@ -46,7 +46,6 @@ class ShotSettings:
         input_color_space: of the color in TIFF, PNG, PFM and HDR files, linear or srgb; auto takes what the files say
             (ICC profile, gamma, color space), or else srgb for 8 and 16 bits, and linear for floats. The result is
             written in it.
-        input_linear: the same as --input-color-space linear.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
             patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
@@ -84,7 +83,6 @@ class ShotSettings:
     color_without_albedo: bool = False
     color_with_albedo: bool = False
     input_color_space: ColorSpace = "auto"
-    input_linear: bool = False
     output_layer: str | None = None
     layers: tuple[str, ...] = ()
     alpha: bool = False
@@ -123,8 +121,6 @@ class ShotSettings:
                 raise InputError(f"--{name}: expected a number above 0, found {limit:g}")
         if self.color_with_albedo and self.color_without_albedo:
             raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
-        if self.input_linear and self.input_color_space == "srgb":
-            raise InputError("--input-linear, --input-color-space: expected one of them, found both")
         if self.is_budgeted and (self.weights is not None or self.model is not None):
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
 
@@ -150,10 +146,14 @@ class ShotSettings:
             InputError: see :func:`mcdenoise.data.open_sequence`; or the frames lack a requested buffer.
         """
         self.check()
-        space: ColorSpace = "linear" if self.input_linear else self.input_color_space
         stated = self.color_with_albedo if self.color_with_albedo or self.color_without_albedo else None
         opened = open_sequence(
-            inputs, self.frames, mapping=self.map, color_has_albedo=stated, lights=self.layers, color_space=space
+            inputs,
+            self.frames,
+            mapping=self.map,
+            color_has_albedo=stated,
+            lights=self.layers,
+            color_space=self.input_color_space,
         )
         if self.output_layer is not None:
             opened.check_output_layer(self.output_layer)

@@ -153,14 +153,6 @@ def test_a_single_channel_is_no_color_beside_a_picture(save: Callable[..., Path]
     assert [float(each) for each in sequence.frame(0).color[0, :, 0, 0]] == pytest.approx([0.5, 0.6, 0.7])
 
 
-def test_both_color_spaces_are_one_too_many(run: Run, tmp_path: Path) -> None:
-    picture(tmp_path / "a.png", "uint8")
-    options = ("-o", tmp_path / "out", "--input-linear", "--input-color-space", "srgb")
-    status, _, errors = run("denoise", tmp_path / "a.png", *options)
-    assert status == 2
-    assert errors.count("\n") == 1
-
-
 @pytest.mark.parametrize("names", ["XYZ", "XYZA", "Y", "YA"])
 def test_the_color_in_another_space_is_written_too(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
     """Mitsuba's films write XYZ or luminance beside the RGB of the nested integrator: never half of a file."""
