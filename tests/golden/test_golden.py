@@ -1,97 +1,98 @@
-"""Images of the shipped models for two shots must not change: whole, tiled, and with skipping.
+"""Images and derivatives of every method, and what commands write, must not change.
 
-``make.py`` creates the images in float64. The bounds come from the responses of the images to rounding, see
-``golden_shots.ALLOWED``. Another test shows that small errors exceed them.
+``make.py`` creates the digests in float64. The bounds come from their changes by rounding, see
+``golden_cases.ALLOWED``. Another test shows that small errors exceed them.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from pathlib import Path
 
 import pytest
 import torch
-from golden_shots import ALLOWED, MODELS, PRECISIONS, SHOTS, change, golden, kept_pixels
-from torch import Tensor
+from golden_cases import (
+    ALLOWED,
+    ALLOWED_EXACT,
+    METHODS,
+    WAYS,
+    Digests,
+    change,
+    digests,
+    golden,
+    is_slow,
+    precision_of,
+    ways_of,
+)
+from golden_commands import COMMANDS, FOLDERS, LOSSES, PIXELS, losses, said, same, texts, written
 
-from mcdenoise import Denoiser, create_model
+from mcdenoise import create_model
+from mcdenoise.models import Model
 
-IMAGES, RESPONSES = golden()
-Precision = Literal["float32", "bfloat16"]
-
-
-def denoised(shot: str, denoiser: Denoiser) -> dict[int, Tensor]:
-    """The pixels of the frames that the file contains."""
-    found = {}
-    for number in range(SHOTS[shot].frames):
-        image = denoiser(SHOTS[shot].frame(number))
-        assert image.dtype == torch.float32
-        if number in SHOTS[shot].kept:
-            found[number] = kept_pixels(image)
-    return found
+DIGESTS, CHANGES = golden()
 
 
-def beyond(shot: str, model: str, precision: str, images: dict[int, Tensor]) -> list[str]:
-    """The frames whose images differ from those in the file by more than rounding."""
-    wrong = []
-    for index, (number, image) in enumerate(images.items()):
-        error = change(image, IMAGES[f"{shot}.{model}.{number}"])
-        response = RESPONSES[f"{shot}.{model}.{precision}"][index]
+def beyond(method: str, way: str, found: Digests) -> list[str]:
+    """The parts that differ from those in the file by more than rounding."""
+    wrong, precision = [], precision_of(method, way)
+    for part, image in found.items():
+        key = f"{method}: {WAYS[way].shot.name}: {part}"
+        error = change(image, DIGESTS[key])
         for what, factor in ALLOWED.items():
-            # Everything except convolutions is in float32.
-            allowed = factor * max(response[what], torch.finfo(torch.float32).eps)
+            if precision == "float64":
+                allowed = ALLOWED_EXACT
+            else:
+                # Everything except convolutions is in float32.
+                allowed = factor * max(CHANGES[key][precision][what], torch.finfo(torch.float32).eps)
             if not error[what] <= allowed:
-                wrong.append(f"frame {number}: {what} difference {error[what]:.3g}, expected at most {allowed:.3g}")
+                wrong.append(f"{key}: {what} difference {error[what]:.3g}, expected at most {allowed:.3g}")
     return wrong
 
 
-WAYS: dict[str, tuple[str, dict[str, Any]]] = {
-    "whole": ("moving", {}),
-    "tiled": ("moving", {"tile": 64}),
-    "skipped": ("still", {}),
-    "skipped and tiled": ("still", {"tile": 64}),
-}
+def differences(method: str, way: str, model: Model | None = None, **settings: object) -> list[str]:
+    return beyond(method, way, digests(method, way, precision_of(method, way), model, **settings))
 
 
-def is_long(way: str, model: str) -> bool:
-    """Whether a shot takes long, where a shorter one shows as much."""
-    return way in ("tiled", "skipped") or (way == "skipped and tiled" and model == "full")
-
-
-@pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize(
-    ("shot", "settings", "model"),
+    ("method", "way"),
     [
-        pytest.param(*WAYS[way], model, id=f"{way}-{model}", marks=[pytest.mark.slow] if is_long(way, model) else [])
-        for way in WAYS
-        for model in MODELS
+        pytest.param(method, way, marks=[pytest.mark.slow] if is_slow(method, way) else [])
+        for method in METHODS
+        for way in ways_of(method)
     ],
 )
-def test_images_agree_with_the_file(shot: str, settings: dict[str, Any], model: str, precision: Precision) -> None:
-    denoiser = Denoiser(MODELS[model], precision=precision, **settings)
-    assert not beyond(shot, model, precision, denoised(shot, denoiser))
+def test_images_agree_with_the_file(method: str, way: str) -> None:
+    assert not differences(method, way)
 
 
 def test_tiles_of_the_still_shot_are_skipped() -> None:
-    model = "micro"
-    computed = denoised("still", Denoiser(MODELS[model], keep_all=True))
-    assert {message.partition(":")[0] for message in beyond("still", model, "float32", computed)} == {
-        "frame 9",
-        "frame 19",
-    }
+    wrong = differences("cascaded_v2_micro", "skipped", keep_all=True)
+    assert {message.split(": ")[2] for message in wrong} == {"passed", "reused"}
 
 
-@pytest.mark.parametrize("precision", PRECISIONS)
-def test_small_errors_of_weights_and_histories_are_found(precision: Precision) -> None:
-    model = "micro"
-    other = create_model(MODELS[model], pretrained=True)
+@pytest.mark.parametrize("way", ["whole", "bfloat16", "gradients"])
+def test_small_errors_of_weights_and_histories_are_found(way: str) -> None:
+    other = create_model("cascaded_v2_micro", pretrained=True)
     with torch.no_grad():
         for parameter in other.parameters():
-            parameter.mul_(1 + (1e-2 if precision == "bfloat16" else 1e-5))
-    assert beyond("moving", model, precision, denoised("moving", Denoiser(other, precision=precision)))
-    longer = Denoiser(MODELS[model], precision=precision, alpha_min=0.6)
-    assert beyond("moving", model, precision, denoised("moving", longer))
+            parameter.mul_(1 + (1e-2 if way == "bfloat16" else 1e-5))
+    assert differences("cascaded_v2_micro", way, other)
+    assert differences("cascaded_v2_micro", way, alpha_min=0.6)
 
 
-def test_the_file_has_every_image_and_is_small() -> None:
-    assert set(IMAGES) == {f"{shot}.{model}.{n}" for shot, what in SHOTS.items() for n in what.kept for model in MODELS}
-    assert all(image.isfinite().all() and image.dtype == torch.float32 for image in IMAGES.values())
+def test_the_file_has_every_method_and_is_small() -> None:
+    assert {key.partition(":")[0] for key in DIGESTS} == {*METHODS, COMMANDS}
+    assert all(digest.isfinite().all() for digest in DIGESTS.values())
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_files_of_a_renderer_are_read_and_written_as_before(folder: Path, tmp_path: Path) -> None:
+    assert same(said("inspect", folder), texts()[folder.name])
+    found, expected = written(folder, tmp_path / "out"), DIGESTS[f"{COMMANDS}: {folder.name}"]
+    assert found.shape == expected.shape
+    assert ((found - expected).abs() <= PIXELS * (expected.abs() + expected.abs().mean(1, keepdim=True))).all()
+
+
+def test_a_short_training_has_the_same_losses(tmp_path: Path) -> None:
+    for package in ("lightning_fabric", "tensorboard"):
+        pytest.importorskip(package, reason="training needs the packages of mcdenoise[train]")
+    torch.testing.assert_close(losses(tmp_path), DIGESTS[f"{COMMANDS}: losses"], rtol=LOSSES, atol=0)
