@@ -97,7 +97,7 @@ def traced(take: Take, frame: int = 1) -> tuple[dict[str, Any], Any]:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     from mcdenoise.scenes.takes.tracing import TakeTracer
 
-    tracer = TakeTracer(take, "scalar_rgb", half=4)
+    tracer = TakeTracer(take, "scalar_rgb", half=20)
     tracer.place(frame)
     return tracer.noisy(frame), tracer.halves(frame)
 
@@ -144,6 +144,23 @@ def test_a_void_is_black_and_transparent() -> None:
     assert not frame["alpha"].any()
     assert np.isinf(frame["depth"]).all()
     assert not np.any(halves)
+
+
+@pytest.mark.parametrize("splatted", [False, True])
+@pytest.mark.parametrize("void", [False, True])
+def test_references_have_the_filter_of_the_frames(void: bool, splatted: bool) -> None:
+    # A shining wall that ends in the middle of the image: its edge is the integral of the filter.
+    shine = {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 1.0, 1.0]}}
+    wall = {**known().scene["wall"], "emitter": shine, "to_world": known().scene["wall"]["to_world"].copy()}
+    wall["to_world"][0, 3] = -9
+    scene = {"type": "scene", "material_0": diffuse((0.0, 0.0, 0.0)), "wall": wall}
+    still = [Camera.look_at((0, 0, 0), (0, 0, -1), FOV)] * 2
+    take = known(scene=scene, cameras=still, void=void, splat=splatted, filter="gaussian", spp=36)
+    frame, halves = traced(take)
+    inside = 0.5 * (1 + math.erf(1 / math.sqrt(2)))
+    for image in (frame["color"], sum(halves) / 2):
+        columns = image.mean((0, 1))
+        assert columns[[10, 11, 12]] == pytest.approx([1, inside, 1 - inside], abs=0.05)
 
 
 def test_exact_features_behind_a_lens_are_those_of_a_pinhole() -> None:

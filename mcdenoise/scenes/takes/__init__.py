@@ -119,9 +119,8 @@ def _render(plan: TakePlan, number: int, path: Path) -> None:
             first, second = tracer.halves(frame)
             means.append((first + second) / 2)
             errors.append((first - second) / 2)
-    if last:
-        # What was seen before the first frame is unknown.
-        arrays["motion"][0] = np.inf
+    # What was seen before the first frame is unknown.
+    arrays["motion"][0] = np.inf
     level = _level(means[-1])
     light = {"color": arrays["color"], "reference": np.stack(means), ERROR: np.stack(errors)}
     arrays |= {name: image * level for name, image in light.items()}

@@ -166,12 +166,17 @@ class TakeTracer:
         camera = self._lens(self.take.cameras[frame])
         before = self._lens(self.take.cameras[max(frame - 1, 0)])
         moved = self._movements(frame)
+        # Samples that are weighed afterwards lie evenly in the pixel.
+        even = self.take.splat and not stratified
         if self._scalar:
             sampler.seed(state, 1)
             found = []
             for number in range(count):
                 column, row = number // spp % width, number // spp // width + top
-                sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact)
+                if stratified and number % spp == 0:
+                    # The strata are those of one pixel.
+                    sampler.seed((state + number) % 2**32, 1)
+                sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact, even)
                 found.append([float(value) for value in sample])
                 sampler.advance()
             return np.nan_to_num(np.array(found, np.float32).T, posinf=0, neginf=0)
@@ -181,7 +186,7 @@ class TakeTracer:
         pixel = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, spp)
         column, row = pixel % dr.opaque(mi.UInt32, width), pixel // dr.opaque(mi.UInt32, width)
         row += dr.opaque(mi.UInt32, top)
-        sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact)
+        sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact, even)
         used = [value for value in sample if not isinstance(value, int | float)]
         dr.eval(used)
         table = np.stack([np.broadcast_to(np.array(value, dtype=np.float32), count) for value in sample])
@@ -198,6 +203,7 @@ class TakeTracer:
         color: bool,
         features: bool,
         exact: bool,
+        even: bool,
     ) -> list[Any]:
         """The 14 channels of a sample, and its place in the pixel."""
         mi, dr, (width, height) = self._mi, self._dr, self.take.size
@@ -206,8 +212,7 @@ class TakeTracer:
         lens = None
         if not exact:
             place, lens = sampler.next_2d(), sampler.next_2d()
-            shift = [place.x, place.y] if self.take.splat and features else [self._shift(u) for u in place]
-            inside = [shift[0], shift[1]] if self.take.splat and features else [shift[0] + 0.5, shift[1] + 0.5]
+            inside = [place.x, place.y] if even else [self._shift(u) + 0.5 for u in place]
             x, y = mi.Float(column) + inside[0], mi.Float(row) + inside[1]
         left, up, forward, origin, k = camera[:3], camera[3:6], camera[6:9], camera[9:12], camera[12]
         across, down = -(2 * x / width - 1) * k, -(2 * y / height - 1) * (k * (height / width))
