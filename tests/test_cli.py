@@ -555,6 +555,15 @@ def test_invalid_colors_are_replaced_and_counted(
     assert [frames[str(number)]["replaced_pixels"] for number in range(4)] == [0, 4, 0, 0]
 
 
+def test_warnings_of_the_library_are_lines_of_the_command(small_sequence: Path, out: Path) -> None:
+    edit(small_sequence / "inputs" / "albedo0.exr", lambda albedo: albedo.__setitem__((0, 0), 3.0))
+    done = process("denoise", small_sequence, "-o", out, "--model", "noisy")
+    assert done.returncode == 0
+    (line,) = [line for line in done.stderr.splitlines() if "albedo" in line]
+    assert line.startswith("warning: ")
+    assert ".py" not in done.stderr
+
+
 def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
     path = tmp_path / "models.json"
     status, text, errors = run("models", "--json", path)

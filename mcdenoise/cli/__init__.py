@@ -12,13 +12,14 @@ import itertools
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from mcdenoise.cli._stdout import forgiving_stdout
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, printable
 from mcdenoise.interruption import Interruption
 from mcdenoise.threads import wait_passively
 
@@ -72,6 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     if of_process:
         # Registered first, and so called last.
         atexit.register(_leave, statuses)
+        warnings.showwarning = _warn
     interruption = Interruption(name)
     interruption.start()
     try:
@@ -88,6 +90,11 @@ def main(arguments: list[str] | None = None) -> None:
             interruption.stop()
     statuses.append(interruption.status(status))
     sys.exit(*statuses)
+
+
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning of Python's as the command's own, in one line without a place in the code."""
+    print(f"warning: {printable(' '.join(str(message).split()))}", file=sys.stderr)
 
 
 def _leave(statuses: list[int]) -> None:

@@ -96,8 +96,13 @@ def _write_exr(
                 return f"it has a channel '{name}' already"
             channels[name] = OpenEXR.Channel(name, _stored(image, kind))
         main.channels = channels
-    for each in file.parts:
-        _leave_room(each)
+    if clamped := {limit for each in file.parts if (limit := _leave_room(each))}:
+        # The text is the same for all frames, so that it is told once.
+        warnings.warn(
+            f"DWA compression stores half floats and rounds them: brighter pixels are clamped to {min(clamped):.0f}; "
+            "store the shot with ZIP compression to keep them",
+            stacklevel=2,
+        )
     try:
         file.write(str(target))
         if strange:
@@ -111,12 +116,17 @@ def _write_exr(
     return "" if len(written) == len(expected) else "incomplete"
 
 
-def _leave_room(part: Any) -> None:
-    """Clamp pixels that DWA compression, which holds halves of any type and rounds them, would turn into infinity."""
+def _leave_room(part: Any) -> float:
+    """Clamp pixels that DWA compression, which holds halves of any type and rounds them, would turn into infinity.
+
+    Returns:
+        The largest value of clamped pixels; 0 if there are none.
+    """
     if part.header["compression"] not in (OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION):
-        return
+        return 0.0
     # Random stars and noise came back up to 1.03 times as bright at a level of 45, 1.1 times at 200, 1.6 times at 1000.
     largest = LARGEST_HALF / (1 + float(part.header.get("dwaCompressionLevel", _DWA_LEVEL)) / 1000)
+    clamped = False
     for name, channel in part.channels.items():
         pixels = channel.pixels
         if name.rpartition(".")[2].lower() not in _DWA_ROUNDS or pixels.dtype == np.uint32:
@@ -124,12 +134,8 @@ def _leave_room(part: Any) -> None:
         above = np.isfinite(pixels) & (np.abs(pixels) > largest)
         if above.any():
             channel.pixels = np.where(above, np.sign(pixels) * largest, pixels).astype(pixels.dtype)
-            # The text is the same for all frames, so that it is told once.
-            warnings.warn(
-                f"DWA compression stores half floats and rounds them: brighter pixels are clamped to {largest:.0f} "
-                f"('{name}'); store the shot with ZIP compression to keep them",
-                stacklevel=2,
-            )
+            clamped = True
+    return largest if clamped else 0.0
 
 
 def _first_line(error: Exception) -> str:
