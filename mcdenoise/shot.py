@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.data.readers.opening import ColorSpace
 from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
@@ -43,9 +42,8 @@ class ShotSettings:
         color_without_albedo: the noisy color was divided by the albedo, and has to be multiplied by it.
         color_with_albedo: the noisy color includes the albedo. By default this is determined from the values; if they
             do not tell, the color is assumed to include it.
-        input_color_space: of the color in TIFF, PNG, PFM and HDR files, linear or srgb; auto takes what the files say
-            (ICC profile, gamma, color space), or else srgb for 8 and 16 bits, and linear for floats. The result is
-            written in it.
+        input_linear: the numbers of TIFF and PNG files are linear radiance. By default the files say so (ICC profile,
+            gamma, color space), or else 8 and 16 bits are sRGB. The result is written as it was read.
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
             patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
@@ -82,7 +80,7 @@ class ShotSettings:
     map: tuple[str, ...] = ()
     color_without_albedo: bool = False
     color_with_albedo: bool = False
-    input_color_space: ColorSpace = "auto"
+    input_linear: bool = False
     output_layer: str | None = None
     layers: tuple[str, ...] = ()
     alpha: bool = False
@@ -153,7 +151,7 @@ class ShotSettings:
             mapping=self.map,
             color_has_albedo=stated,
             lights=self.layers,
-            color_space=self.input_color_space,
+            color_space="linear" if self.input_linear else "auto",
         )
         if self.output_layer is not None:
             opened.check_output_layer(self.output_layer)

@@ -15,5 +15,6 @@ class ShotOptions(ShotSettings):
     map: Map = ()
     color_without_albedo: Flag = False
     color_with_albedo: Flag = False
+    input_linear: Flag = False
     layers: Layers = ()
     alpha: Flag = False

@@ -6,7 +6,6 @@ from mcdenoise.cli._options import Flag, Inputs, Json, Map
 from mcdenoise.cli._output import print_rows, say, warn, write_json
 from mcdenoise.data import Sequence
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
-from mcdenoise.data.readers.opening import ColorSpace
 from mcdenoise.errors import printable
 from mcdenoise.shot import ShotSettings
 
@@ -17,7 +16,7 @@ def inspect(
     map: Map = (),
     color_without_albedo: Flag = False,
     color_with_albedo: Flag = False,
-    input_color_space: ColorSpace = "auto",
+    input_linear: Flag = False,
     json: Json = None,
 ) -> None:
     """Show from which layers the buffers of a shot would be read, how, and why, and the model, without denoising.
@@ -28,7 +27,7 @@ def inspect(
         map: layer of a buffer that is not recognized by name, such as albedo=RGBA.diff; 'motion=' for none.
         color_without_albedo: the noisy color was divided by the albedo.
         color_with_albedo: the noisy color was not divided by the albedo.
-        input_color_space: of the color in TIFF, PNG, PFM and HDR files; by default what the files say.
+        input_linear: the numbers of TIFF and PNG files are linear radiance; by default what the files say.
         json: write the printed figures to this file too.
     """
     shot = ShotSettings(
@@ -36,7 +35,7 @@ def inspect(
         map=map,
         color_without_albedo=color_without_albedo,
         color_with_albedo=color_with_albedo,
-        input_color_space=input_color_space,
+        input_linear=input_linear,
     )
     opened = shot.open(inputs)
     print_sequence(opened)

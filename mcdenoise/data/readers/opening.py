@@ -303,7 +303,7 @@ def _look_at_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
         words.append("display values, made linear")
         shot.warnings.append(
             "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats, or say "
-            "--input-color-space linear if its numbers are linear"
+            "--input-linear if its numbers are linear"
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
     color = np.nan_to_num(images["color"][..., :3])
