@@ -23,6 +23,7 @@ from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep
 
 _ROUNDS = 3
+_TRIED = "only models with weights of this package are tried, so that oidn_temporal needs --model"
 # Number of frames with a reference on which errors are measured, and of frames before the first of them.
 _SCORED = 4
 _HISTORY = 8
@@ -92,7 +93,9 @@ def choose_model(
     choices = _timed(sequence.size, device, cache_file("run_times.json") if cache is None else cache, on_step)
     affordable = [choice for choice in choices if budget is None or choice.milliseconds <= budget]
     if not affordable:
-        raise InputError(f"--budget-ms: expected a model that takes at most {budget:g} ms, found at best {choices[0]}")
+        raise InputError(
+            f"--budget-ms: expected a model that takes at most {budget:g} ms, found at best {choices[0]}; {_TRIED}"
+        )
     if max_error is None:
         known = _with_errors(affordable, sequence, results, device)
         return min(known, key=lambda choice: (choice.error or 0.0, -choice.milliseconds))
@@ -107,7 +110,9 @@ def choose_model(
             best = scored
     within = "" if budget is None else f" in {budget:g} ms"
     found = "no error of any" if best is None else f"at best {best}"
-    raise InputError(f"--max-error: expected a model with SMAPE of at most {max_error:g}{within}, found {found}")
+    raise InputError(
+        f"--max-error: expected a model with SMAPE of at most {max_error:g}{within}, found {found}; {_TRIED}"
+    )
 
 
 def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[int, int], None]) -> list[Choice]:
