@@ -139,6 +139,7 @@ class FrameReport(Journal):
             "skipped": ", ".join(skipped),
             "missing": ", ".join(self.missing),
             "replaced pixels": str(self.replaced_pixels or ""),
+            "fireflies": f"{self.fireflies:.2%} of the light clamped" if self.fireflies > 0 else "",
             "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
             "tiles": self.tiles,
             "precision": self.precision,

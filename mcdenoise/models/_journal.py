@@ -70,6 +70,7 @@ class Journal:
         reset: why the history was discarded; empty if it was used.
         tiles: how the image was divided into tiles, and why.
         history: fraction of the pixels that have a history; ``None`` if no history was looked up.
+        fireflies: fraction of the light that was clamped in fireflies.
     """
 
     milliseconds: dict[str, float] = field(default_factory=dict)
@@ -77,6 +78,7 @@ class Journal:
     reset: str = ""
     tiles: str = ""
     history: float | None = None
+    fireflies: float = 0.0
 
     def __post_init__(self) -> None:
         # These are no dataclass fields, because a written report must not contain them.

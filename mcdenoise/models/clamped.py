@@ -1,4 +1,4 @@
-"""A wrapper that clamps fireflies: single pixels that are far brighter than all others around them.
+"""A wrapper that clamps fireflies: single pixels that are far brighter than all others around them, in one frame only.
 
 A network that removes noise spreads a firefly over a spot. Where few paths find a small light, many spots add up to an
 image that is far brighter than nearly all pixels of the converged one. The clamped image lacks their light.
@@ -6,22 +6,46 @@ image that is far brighter than nearly all pixels of the converged one. The clam
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
+from torch import Tensor
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._fireflies import GAIN, steady, tell_clamped
 from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._journal import timed
+from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import CAUSTICS, light_of_fireflies
+from mcdenoise.models.accumulated import CAUSTICS, light_of_fireflies, motion_to_previous
+from mcdenoise.noise import noise_of
 from mcdenoise.ops._steps.history import incoming
 
 # Fraction of the light up to which bright pixels are fireflies, and from which they are caustics, and the limit of
 # fireflies. With one sample a pixel a limit of 15 has a smaller SMAPE in most scenes, but a lower PSNR.
 _RARE, _COMMON, _LIMIT = 0.05, 0.15, 30.0
+# Level of noise below which a bright pixel is no firefly: where pixels vary by less than some two per cent.
+_CLEAN = 0.004
+
+
+class Kept(NamedTuple):
+    """What is known of the frame before.
+
+    Args:
+        light: ``(B, 1, H, W)`` its demodulated radiance without fireflies, the sum of its channels.
+        view_projection: ``(B, 4, 4)`` its camera.
+    """
+
+    light: Tensor
+    view_projection: Tensor | None
 
 
 class Clamped(Wrapper):
     """Hands a method frames with clamped fireflies, see :func:`without_fireflies`.
+
+    Light that lasts is none: a pixel may be six times as bright as in the frame before. Nor is a bright pixel of a
+    frame that has hardly any noise. The method does not see such light, which it would take for noise: it is added to
+    the image as it is.
 
     Args:
         inner: any method.
@@ -33,24 +57,57 @@ class Clamped(Wrapper):
         needs = self.inner.needs
         return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, None, needs.stride)
 
+    @property
+    def persistence(self) -> float:
+        """What one more frame leaves of the limit's lack, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 / GAIN
+
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
+        kept, inner = own_pair(state, "clamped")
+        before = own_state(kept, Kept, frame, channels=1)
         with timed("clamp", frame.color.device):
-            clamped = without_fireflies(frame)
-        return self.inner(clamped, state)
+            clamped, steady_light, after = _clamped(frame, before)
+        output, inner = self.inner(clamped, inner)
+        output = output._replace(image=output.image + steady_light.to(output.image.dtype))
+        return output, None if after is None and inner is None else (after, inner)
 
 
 def without_fireflies(frame: Frame) -> Frame:
     """The frame with clamped fireflies (:func:`mcdenoise.ops.clamp_fireflies` of the demodulated radiance).
 
     The limit rises from 30 to 120 with the fraction of the light that fireflies have: the more it is, the more likely
-    they are caustics. All other pixels remain as they are.
+    they are caustics. All other pixels remain as they are, and all of them do in a frame with hardly any noise.
     """
+    clamped, clean, _ = _clamped(frame, None)
+    return frame.replace(color=clamped.color + clean)
+
+
+def _clamped(frame: Frame, kept: Kept | None) -> tuple[Frame, Tensor, Kept | None]:
+    """The frame with clamped fireflies, the light that the clamp took and that is none, and what to keep."""
     light = incoming(frame.color, frame.albedo, torch.inf, compared=False)
     common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
     limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
-    before, after = (image.sum(1, keepdim=True) for image in (light, incoming(light, None, limit, compared=False)))
+    clamped = incoming(light, None, limit, compared=False)
+    full, least = (image.sum(1, keepdim=True) for image in (light, clamped))
+    # What the neighbours of a bright pixel have in the mean takes its place, as its own light is no noise of theirs.
+    without = _scaled(frame.color.detach(), full.detach(), torch.where(least < full, least / limit, full).detach())
+    clean = noise_of(without, frame.albedo, frame.normal).level < _CLEAN
+    believed = torch.where(clean, light, clamped)
+    if kept is not None and kept.light.shape == full.shape:
+        passed = steady(light, believed, kept.light, motion_to_previous(frame, kept.view_projection))
+        believed = believed if passed is None else passed
+    after = believed.sum(1, keepdim=True)
+    color, bright = _scaled(frame.color, full, least), _scaled(frame.color, full, after)
+    tell_clamped(frame.color, bright)
+    keeps = frame.hints.keep_all or not frame.hints.last
+    kept = Kept(after.detach(), frame.view_projection) if keeps else None
+    return frame.replace(color=color), bright - color, kept
+
+
+def _scaled(color: Tensor, before: Tensor, after: Tensor) -> Tensor:
+    """The color of pixels whose light, the sum of channels, was one and shall be another."""
     # A quotient of equal numbers is exactly 1. The derivative of 0 / 0 would be NaN.
     lit = before > 0
     factor = torch.where(lit, after / torch.where(lit, before, 1), 1)
-    return frame.replace(color=(frame.color * factor).to(frame.color.dtype))
+    return (color * factor).to(color.dtype)

@@ -15,7 +15,9 @@ from mcdenoise.train.front import split
 def test_a_firefly_has_thirty_times_the_light_around_it_and_its_own_hue() -> None:
     albedo = torch.full((1, 3, 40, 60), 0.5)
     albedo[..., 30:] = 0.2
-    frame = Frame(albedo * torch.tensor([1.0, 2.0, 3.0]).reshape(1, 3, 1, 1), albedo=albedo)
+    light = torch.ones(1, 3, 40, 60)
+    light[..., :9, :] += torch.rand(1, 3, 9, 60, generator=torch.Generator().manual_seed(0))
+    frame = Frame(albedo * light * torch.tensor([1.0, 2.0, 3.0]).reshape(1, 3, 1, 1), albedo=albedo)
     color = frame.color.clone()
     color[..., 20, 29] *= 1e4
     output, _ = Clamped(Same())(frame.replace(color=color))
@@ -30,6 +32,8 @@ def test_the_more_light_fireflies_have_the_less_they_are_clamped() -> None:
     for apart in (64, 32, 8):
         color = torch.ones(1, 3, 192, 256)
         color[..., 4::apart, 4::apart] = 100
+        # A frame without noise has no fireflies.
+        color[..., 160:, :] = 0.5 + torch.rand(1, 3, 32, 256, generator=torch.Generator().manual_seed(0))
         clamped = without_fireflies(Frame(color)).color
         highest[apart] = float(clamped.max())
         assert torch.equal(clamped[color == 1], color[color == 1])

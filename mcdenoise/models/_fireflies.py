@@ -1,0 +1,73 @@
+"""Which bright pixels are fireflies: not those that were bright in the frame before, too."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from mcdenoise.models._journal import ask, journal
+from mcdenoise.models._reads import at_hand
+
+# A pixel may be this many times as bright as it was in the frame before. What is clamped there is believed a little
+# more in every frame, so that a star a thousand times as bright as its sky has its light from the fourth or fifth frame
+# on, while two fireflies in one place remain fireflies.
+GAIN = 6.0
+
+
+def steady(light: Tensor, clamped: Tensor, before: Tensor, motion: Tensor | None) -> Tensor | None:
+    """The clamped light, and where it was bright before as much more as that allows.
+
+    Args:
+        light: ``(B, 3, H, W)`` before clamping.
+        clamped: ``(B, 3, H, W)`` after it.
+        before: ``(B, C, H, W)`` of the frames before, clamped: three channels, or their sum.
+        motion: ``(B, 2, H, W)`` to the frame before; ``None`` if nothing moves, or where nothing tells what does.
+
+    Returns:
+        ``(B, 3, H, W)``; ``None``, if values can be read, where it would be the clamped light.
+    """
+    full, least, allowed = (image.sum(1, keepdim=True) for image in (light, clamped, before.detach()))
+    known = at_hand(light.device)
+    if known and not (full > least).any():
+        return None
+    bound = torch.maximum(GAIN * _moved(allowed, motion), least)
+    passes = (full > least) & (bound > least)
+    if known and not passes.any():
+        return None
+    ratio = torch.minimum(bound / torch.where(full > 0, full, 1), torch.ones_like(full))
+    return torch.where(passes, light * ratio, clamped)
+
+
+def _moved(image: Tensor, motion: Tensor | None) -> Tensor:
+    """The largest of the pixels around the place of each pixel in the frame before; 0 outside of it.
+
+    A light of one pixel that moves by a third of a pixel stays in its pixel twice, and then is in the next one.
+    """
+    if motion is None:
+        return image
+    height, width = image.shape[2:]
+    motion = motion.to(torch.promote_types(motion.dtype, torch.float32)).nan_to_num(torch.inf)
+    x = torch.arange(width, device=image.device) + motion[:, 0]
+    y = torch.arange(height, device=image.device)[:, None] + motion[:, 1]
+    found = torch.zeros_like(image)
+    for row, column in itertools.product((y.floor(), y.ceil()), (x.floor(), x.ceil())):
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        place = torch.where(inside, row, 0).long() * width + torch.where(inside, column, 0).long()
+        there = image.flatten(1).gather(1, place.flatten(1)).reshape_as(image)
+        found = torch.where(inside[:, None], torch.maximum(found, there), found)
+    return found
+
+
+def tell_clamped(light: Tensor, clamped: Tensor) -> None:
+    """Report the fraction of the light that clamping takes; both are ``(B, 3, H, W)``."""
+    if (found := journal()) is None:
+        return
+    before, after = (image.detach().mean((1, 2, 3)) for image in (light, clamped))
+
+    def tell(fraction: Sequence[float]) -> None:
+        found.fireflies = max(found.fireflies, *fraction)
+
+    ask(torch.where(before > 0, (before - after) / torch.where(before > 0, before, 1), 0), tell)
