@@ -156,6 +156,16 @@ def test_the_likely_mistake_of_a_camera_is_told(change: Callable[[Tensor], Tenso
         assert word in message
 
 
+@pytest.mark.parametrize("moves", [0.3, 40.0])
+def test_noise_alone_tells_nothing_of_motion(moves: float) -> None:
+    """Interpolated noise is less unlike any noise, so that another reading of the motion seems better."""
+    frames = [
+        Frame(*torch.rand(2, 1, 3, 48, 64), normal=torch.rand(1, 3, 48, 64), motion=moves * torch.randn(1, 2, 48, 64))
+        for _ in range(2)
+    ]
+    assert doubt_motion(frames[1], seen_in(frames[0])) == ""
+
+
 def test_what_is_not_used_is_not_doubted() -> None:
     frames = [by_motion(frame.replace(motion=-frame.motion)) for frame in shot() if frame.motion is not None]
     denoiser = Denoiser("noisy")
