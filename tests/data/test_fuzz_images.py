@@ -170,10 +170,7 @@ def fuzz(tmp_path: Path, intact: dict[str, bytes], count: int, seed: int) -> Non
 
 def test_intact_files_come_out_as_they_went_in(tmp_path: Path, intact: dict[str, bytes]) -> None:
     found = outcomes(tmp_path / "intact", intact, tmp_path / "written")
-    expected = dict.fromkeys(intact, "") | {
-        "mips.exr": "found a texture of several resolutions",
-        **dict.fromkeys(("grey8.png", "grey16.png", "grey_little.pfm", "grey_big.pfm"), "found grey"),
-    }
+    expected = dict.fromkeys(intact, "") | {"mips.exr": "found a texture of several resolutions"}
     assert all((words in found[name]) and bool(words) == bool(found[name]) for name, words in expected.items())
 
 

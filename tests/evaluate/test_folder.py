@@ -333,7 +333,6 @@ def test_pixels_that_are_not_finite_are_counted(small_sequence: Path, images: Pa
     ("shape", "channels", "message"),
     [
         ((20, 23, 3), RGB, "expected 24 x 20 pixels like the sequence, found 23 x 20"),
-        ((20, 24, 1), ["Y"], "expected noisy radiance, found Y"),
         ((20, 24, 3), ["albedo.R", "albedo.G", "albedo.B"], "expected noisy radiance, found albedo.RGB"),
         ((20, 24, 6), [f"{eye}.{c}" for eye in ("left", "right") for c in RGB], "found left.RGB, right.RGB"),
     ],
