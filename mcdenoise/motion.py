@@ -32,6 +32,8 @@ _TELLING = 0.98
 # Motion contradicts the frames if it matches this much worse than no motion, and moves this many pixels by this
 # distance; smaller motion only blurs the compared image, which proves nothing.
 _CONTRADICTS, _FAR = 1.1, 2.0
+# Mean difference of frames below which they are the same up to rounding, and tell nothing of motion.
+_UNLIKE = 1e-3
 # Number of compared pairs of frames.
 MOTION_PAIRS = 3
 # Approximate number of sampled pixels.
@@ -340,7 +342,7 @@ def _contradiction(pair: Pair) -> str:
     at_rest = _mismatch(now, before, motion, Convention(0, 0, ""))
     # The first one is the usual convention.
     best = min(range(len(read)), key=lambda i: errors[i] / (_BETTER if "half" in read[i][0].words else 1))
-    if errors[best] < _BETTER * errors[0] and errors[best] < _BETTER * at_rest:
+    if at_rest > _UNLIKE and errors[best] < _BETTER * errors[0] and errors[best] < _BETTER * at_rest:
         return f"the frame before looks alike only if it is read as {read[best][0].words}"
     return ""
 
