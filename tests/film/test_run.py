@@ -71,7 +71,7 @@ def test_it_says_what_it_did(shots: dict[str, Path], tmp_path: Path) -> None:
     assert page.count("<h2 ") == 3
 
 
-SETTINGS = {"anti_lag": True, "input_linear": False, "preview_fps": 24.0}
+SETTINGS = {"anti_lag": True, "preview_fps": 24.0}
 
 
 def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Path) -> None:

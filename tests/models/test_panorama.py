@@ -32,9 +32,12 @@ def test_the_first_column_may_be_any(model: str) -> None:
         assert image.alpha.shape == (1, 1, 40, 160)
         assert all(stage.shape[-1] == 160 for stage in image.stages.values())
     # Not so without it.
-    other = Denoiser(model)
-    other(panorama())
-    plain = [Denoiser(model)(panorama(turn)) for turn in (0, 80)]
+    bare = Denoiser(model), Denoiser(model)
+    for number in range(2):
+        plain = [
+            denoiser(panorama(turn, number=number).map(lambda x, n=3 * number: x.roll(n, -1)))
+            for denoiser, turn in zip(bare, (0, 80), strict=True)
+        ]
     assert (plain[1] - plain[0].roll(80, -1)).abs().max() > 0.01
 
 
@@ -51,4 +54,5 @@ def test_a_still_of_arrays() -> None:
     color = panorama().color[0].permute(1, 2, 0).numpy()
     image = mcdenoise.denoise(color, wrap=True, model="joint_bilateral")
     turned = mcdenoise.denoise(np.roll(color, 80, 1), wrap=True, model="joint_bilateral")
-    np.testing.assert_allclose(turned, np.roll(image, 80, 1), rtol=1e-4)
+    # The exposure of the guide counts the columns near the border twice, which are others here and there.
+    np.testing.assert_allclose(turned, np.roll(image, 80, 1), rtol=3e-3)
