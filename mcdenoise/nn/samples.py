@@ -14,7 +14,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import LARGEST_RADIANCE, Frame
+from mcdenoise.frame import Frame
+from mcdenoise.light import LARGEST_RADIANCE
 from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.ops._window import corner, up_to_multiple
 

@@ -20,7 +20,7 @@ import numpy as np
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import Light, color_of, find_parts
-from mcdenoise.frame import LARGEST_RADIANCE
+from mcdenoise.light import LARGEST_RADIANCE
 
 DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission", "specular_albedo"
 # Optional buffers that few methods use and that are slow to read.
