@@ -450,9 +450,7 @@ def test_a_truncated_image_leaves_only_whole_files(
     assert whole_images(out) == ["denoised0.exr", "denoised1.exr"]
 
 
-@pytest.mark.parametrize(
-    ("stem", "buffer"), [("albedo", "albedo"), ("shading_normal", "normal"), ("world_position", "position")]
-)
+@pytest.mark.parametrize(("stem", "buffer"), [("albedo", "albedo"), ("shading_normal", "normal")])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_an_invalid_feature_leaves_only_whole_files(
     refused: Callable[..., str],

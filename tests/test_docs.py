@@ -124,4 +124,4 @@ def test_each_version_of_the_changelog_has_its_sections_once_and_in_order() -> N
     assert versions[0].startswith("[Unreleased]")
     for version in versions:
         sections = re.findall(r"^### (\w+)$", version, re.MULTILINE)
-        assert sections == [name for name in ("Added", "Changed", "Fixed", "Removed") if name in sections]
+        assert sections == [name for name in ("Added", "Changed", "Fixed", "Removed", "Security") if name in sections]
