@@ -228,8 +228,8 @@ frame = mcdenoise.Frame(images[0], albedo=images[1], normal=images[2], depth=ima
 for model, precision in (("cascaded_v2_micro", "auto"), ("oidn_tuned", "bfloat16")):
     for differentiable in (False, precision == "auto"):
         denoiser = mcdenoise.Denoiser(model, precision=precision, differentiable=differentiable)
-        for _ in range(2):
-            denoiser(frame)
+        for number in range(2):
+            denoiser(frame.replace(color=images[0].roll(number, -1)))
             str(denoiser.report)
         try:
             denoiser(frame.replace(depth=images[3] * torch.nan))
