@@ -451,7 +451,7 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(small_seque
 def test_other_data_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
     config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
     train(config, [small_sequence], run)
-    assert f"{run / 'data.json'}: expected the same" in refused(lambda: train(config, [small_sequence] * 2, run))
+    assert f"{run / 'data.json'}: expected sequences=" in refused(lambda: train(config, [small_sequence] * 2, run))
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x02}q\x00.", None])
