@@ -37,6 +37,8 @@ _ENCODED = re.compile(rb"base64,([A-Za-z0-9+/=]+)")
 _PATIENCE = 900  # seconds
 _LARGEST_MEMBER, _LARGEST_ARCHIVE, _LARGEST_SIDE = 12 << 20, 256 << 20, 8192
 _TEXTURE = 512
+# Coordinates in textures beyond this have no digits left for the texel, and some models have them.
+_FARTHEST = 1000.0
 _LICENCES = {
     "BlendSwap-CC-0": "CC0 1.0",
     "BlendSwap-CC-BY": "CC-BY 3.0",
@@ -375,10 +377,11 @@ def _triangles(
     if (index >= counts).any() or (index[:, 0] < 0).any():
         raise ValueError("indices of vertices that do not exist")
     has_uv, has_normals = (bool(len(table)) and bool((index[:, k] >= 0).all()) for k, table in ((1, uv), (2, normals)))
+    used = uv[index[:, 1]].astype(np.float32) if has_uv else None
     return Mesh(
         vertices[index[:, 0]].astype(np.float32),
         np.array([names[corner] for corner in flat], np.int32).reshape(-1, 3),
-        uv[index[:, 1]].astype(np.float32) if has_uv else None,
+        None if used is None or float(np.abs(used).max()) > _FARTHEST else used,
         normals[index[:, 2]].astype(np.float32) if has_normals else None,
     )
 

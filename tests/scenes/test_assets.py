@@ -90,6 +90,13 @@ def test_damaged_models_are_refused_in_one_line(tmp_path: Path, text: str) -> No
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(("far", "kept"), [("-3.5", True), ("3.4e9", False)])
+def test_places_in_textures_without_digits_are_left_out(tmp_path: Path, far: str, kept: bool) -> None:
+    text = BOX.format(mtl="box.mtl").replace("vt 0 0", f"vt 0 {far}")
+    ((mesh, _),) = opened(tmp_path, box=text).read()
+    assert (mesh.uv is not None) == kept
+
+
 def test_members_are_read_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = opened(tmp_path)
     monkeypatch.setattr(assets, "_LARGEST_MEMBER", 20)

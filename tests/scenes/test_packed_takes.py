@@ -129,6 +129,17 @@ def test_motion_follows_what_moves() -> None:
     assert np.allclose(frame["motion"][0], -SHIFT, atol=1e-3)
 
 
+def test_noise_is_none_in_plain_light_and_all_where_samples_find_no_light() -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    from mcdenoise.scenes.takes.tracing import TakeTracer
+
+    dark = {key: value for key, value in known().scene.items() if key != "sky"}
+    empty = {key: value for key, value in known().scene.items() if key != "wall"}
+    assert TakeTracer(known(scene=empty), "scalar_rgb").noise(1) == pytest.approx(0)
+    assert TakeTracer(known(), "scalar_rgb").noise(1) < 0.3
+    assert TakeTracer(known(scene=dark), "scalar_rgb").noise(1) == 1
+
+
 @pytest.mark.parametrize(("glossy", "albedo"), [("black", 0.0), ("white", 1.0)])
 def test_glass_has_the_albedo_that_the_take_says(glossy: str, albedo: float) -> None:
     scene = {**known().scene, "material_0": glass(1.5)}

@@ -20,7 +20,7 @@ from mcdenoise.scenes.random.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.scenes.random.textures import texture, wall_color
+from mcdenoise.scenes.random.textures import Color, texture, wall_color
 
 Rng = np.random.Generator
 # A room with more shapes than this gets no more furniture.
@@ -244,8 +244,19 @@ def closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None
         builder.points.append((frame @ where)[:3, 3])
 
 
-def wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float = 0.5) -> float:
-    """A wall with a row of windows, with bars, and a fraction with blinds or curtains; returns the windows' area."""
+def wall_with_windows(
+    builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float = 0.5, glow: Color | None = None
+) -> float:
+    """A wall with a row of windows with bars; returns the windows' area.
+
+    Args:
+        builder: collects the objects.
+        rng: the source of randomness.
+        size: of the room.
+        wall: 0 to 3.
+        dressed: probability of blinds or curtains.
+        glow: radiance of a sheet behind each window, instead of what is outside.
+    """
     frame, length = _wall_frame(size, wall)
     height = float(size[1])
     count = int(rng.integers(1, 4)) if length > 3 else 1
@@ -277,6 +288,9 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, size: Array, wall: int, d
             )
         for n in range(rows):
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
+        if glow is not None:
+            black = builder.material(diffuse((0.02, 0.02, 0.02)))
+            parts.append(sheet((x, sill + tall / 2, -_WALL - 0.02), (wide / 2, tall / 2), black, np.eye(4), glow))
         if glazed:
             parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
         if dressing == "blinds":

@@ -23,7 +23,7 @@ __all__ = ["TakePlan", "render_takes"]
 
 _ATTEMPTS = 6
 # Largest SMAPE between two means of eight samples: with more, the references are noise, too.
-_NOISIEST = 0.6
+_NOISIEST = 0.65
 _MIDDLE = 0.2
 _BLOCK = 8
 

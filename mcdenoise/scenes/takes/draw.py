@@ -18,6 +18,7 @@ from mcdenoise.scenes.takes.furnish import Stock
 from mcdenoise.scenes.takes.places import build
 
 FRAMES, REFERENCES = 16, 3
+_KIND = 1
 # Width and height of clips and of stills: about the same number of paths each.
 _CLIP, _STILL = (192, 128), (384, 256)
 _STILLS = 0.35
@@ -96,7 +97,8 @@ def draw_take(
         np.random.default_rng(child) for child in np.random.SeedSequence((number, attempt)).spawn(4)
     )
     stock = Stock(assets)
-    builder, void = build(place_rng, stock)
+    # Another attempt is a place of the same kind, so that hard kinds are as many.
+    builder, void = build(place_rng, stock, float(np.random.default_rng((number, _KIND)).random()))
     still = rng.random() < _STILLS
     size = size or (_STILL if still else _CLIP)
     count = 1 if still else frames

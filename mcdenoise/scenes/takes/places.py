@@ -10,7 +10,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh, read_sky
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, box, place, sheet
-from mcdenoise.scenes.random.lights import add_lamps, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.lights import add_lamps, light_color, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import diffuse, glass, random_opaque
 from mcdenoise.scenes.random.rooms import (
     closed_wall,
@@ -22,17 +22,19 @@ from mcdenoise.scenes.random.rooms import (
     wall_with_windows,
 )
 from mcdenoise.scenes.random.shiny import shine
-from mcdenoise.scenes.random.textures import random_color
+from mcdenoise.scenes.random.textures import Color, random_color
 from mcdenoise.scenes.takes.furnish import Floor, Stock, add_model, bumpy, fill_room, fill_top
 
 Rng = np.random.Generator
 _BUMPY, _FINE, _SHINY = 0.2, 0.12, 0.35
 # Light through blinds takes more samples than a reference has.
 _DRESSED = 0.2
+# Fraction of day rooms whose windows are lights themselves, which takes fewer samples than a sky behind them.
+_GLOWING = 0.5
 
 
-def build(rng: Rng, stock: Stock) -> tuple[SceneBuilder, bool]:
-    """A random place, and whether its background is void."""
+def build(rng: Rng, stock: Stock, pick: float) -> tuple[SceneBuilder, bool]:
+    """A random place, and whether its background is void; ``pick`` from 0 to 1 chooses the kind."""
     kinds: list[tuple[Callable[[Rng, Stock], SceneBuilder], float]] = [
         (_day, 0.28),
         (_evening, 0.22),
@@ -47,7 +49,7 @@ def build(rng: Rng, stock: Stock) -> tuple[SceneBuilder, bool]:
     if not stock.assets.models:
         # What consists of models only would be empty.
         kinds[2], kinds[3], kinds[5] = (kinds[6][0], 0.22), (kinds[7][0], 0.08), (kinds[6][0], 0.06)
-    number = int(rng.choice(len(kinds), p=[chance for _, chance in kinds]))
+    number = int(np.searchsorted(np.cumsum([chance for _, chance in kinds[:-1]]), pick))
     builder = kinds[number][0](rng, stock)
     areas = builder.areas()
 
@@ -94,13 +96,13 @@ def any_sky(rng: Rng, stock: Stock, level: float, sun: Array | None, ratio: floa
     return np.asarray(image * level / max(float((image * rows).mean() / rows.mean()), 1e-6))
 
 
-def _room(rng: Rng, windows: list[int]) -> tuple[SceneBuilder, float]:
+def _room(rng: Rng, windows: list[int], glow: Color | None = None) -> tuple[SceneBuilder, float]:
     """A room without furniture, and the area of its windows."""
     builder, size = empty_room(rng)
     opening = 0.0
     for wall in range(4):
         if wall in windows:
-            opening += wall_with_windows(builder, rng, size, wall, _DRESSED)
+            opening += wall_with_windows(builder, rng, size, wall, _DRESSED, glow)
         else:
             closed_wall(builder, rng, size, wall)
     return builder, opening
@@ -114,10 +116,13 @@ def _surface(builder: SceneBuilder) -> float:
 def _day(rng: Rng, stock: Stock) -> SceneBuilder:
     """A furnished room lit through its windows."""
     windows = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.4, 0.4, 0.2]))].tolist()
-    builder, opening = _room(rng, windows)
+    red, green, blue = (10 * channel for channel in light_color(rng))
+    glow = (red, green, blue) if rng.random() < _GLOWING else None
+    builder, opening = _room(rng, windows, glow)
     level = float(np.clip(0.25 * _surface(builder) / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
     sun = sun_direction(rng, outwards(windows[0])) if rng.random() < 0.65 else None
-    builder.set_sky(any_sky(rng, stock, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
+    if glow is None:
+        builder.set_sky(any_sky(rng, stock, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     lamps = rng.random() < 0.25
     if lamps:
         add_lamps(builder, rng, builder.low, builder.high, int(rng.integers(1, 3)), 0.1)

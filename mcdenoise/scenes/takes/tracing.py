@@ -24,6 +24,8 @@ MAX_DEPTH, _RR_DEPTH = 8, 3
 HALF = 132
 _CLEAN, _PROBE = 16, 8
 _WAVEFRONT = 2**22
+# No light of a scene is as bright by far: such a sample is an error of rounding, and one would spoil a reference.
+_LARGEST = 1e8
 _NULLS = 3
 # Channels of a sample: color 3, albedo 3, normal 3, hit, depth, motion 2, roughness.
 _COLOR, _ALBEDO, _NORMAL, _HIT, _DEPTH, _MOTION, _ROUGHNESS = 3, 6, 9, 9, 10, 11, 13
@@ -101,9 +103,13 @@ class TakeTracer:
     def noise(self, frame: int) -> float:
         """SMAPE between two means of a few samples: 0 without noise, 1 where few samples find light at all."""
         seeds = ((self.take.number, frame, part) for part in (4, 5))
-        first, second = (self._trace(frame, _PROBE, seed, color=True)[0][..., :3].mean((1, 2)) for seed in seeds)
-        total = first + second
-        return float((np.abs(first - second) / np.maximum(total, 1e-3 * total.mean() + 1e-12)).mean())
+        both = [self._trace(frame, _PROBE, seed, color=True)[0].mean(1) for seed in seeds]
+        first, second = (samples[:, :3].mean(-1) for samples in both)
+        total, seen = first + second, both[0][:, _HIT] > 0
+        # What is seen and has no light in any sample is as noisy as can be.
+        lit = total > 1e-3 * total.mean()
+        noise = np.where(lit, np.abs(first - second) / np.maximum(total, 1e-30), 1)
+        return float(noise[lit | seen].mean())
 
     def release(self) -> None:
         """Give the memory back that Dr.Jit keeps for the next scene."""
@@ -226,7 +232,8 @@ class TakeTracer:
         channels: list[Any] = [0.0] * _CHANNELS
         if color:
             radiance = self._path.sample(self._tracer.scene, sampler, ray)[0]
-            radiance = dr.select(dr.all(dr.isfinite(radiance)), radiance, mi.Color3f(0))
+            sane = dr.all(dr.isfinite(radiance)) & (dr.max(radiance) < _LARGEST)
+            radiance = dr.select(sane, radiance, mi.Color3f(0))
             channels[:3] = list(radiance)
         if features:
             channels[3:] = self._features(ray, camera, before, moved)
