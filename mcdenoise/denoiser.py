@@ -106,6 +106,7 @@ class FrameReport(Journal):
 
     Args:
         precision: the reason for the precision of the convolutions.
+        model: the model that the first frame has picked, and why; empty if it was named.
         repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
         repeats: the advice for frames that repeat the noise of the frame before; empty for others.
         missing: buffers that would improve the result and that the frame lacks.

@@ -110,9 +110,11 @@ def noise_is_repeated(frame: Frame, seen: Frame, before: Frame) -> bool:
     else:
         pairs = (seen.position, before.position), (seen.view_projection, before.view_projection)
         still = all(a is not None and b is not None and torch.equal(a, b) for a, b in pairs)
+    if not still:
+        return False
     alone = frame.albedo is None or frame.normal is None
     level = noise_of(frame.color, frame.albedo, frame.normal).level.amin()
-    return still and bool(level > (_REPEATED_ALONE if alone else _REPEATED))
+    return bool(level > (_REPEATED_ALONE if alone else _REPEATED))
 
 
 def _between(x: Tensor, start: float, end: float) -> Tensor:

@@ -17,10 +17,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.frame import RADIANCE, Frame, scale_samples
+from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
 from mcdenoise.models._journal import note
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models.exposed import scaled
 
 # Where more than this fraction of the light is in pixels of alpha 0 (a glow), alpha does not say where light can be.
 _GLOW = 1e-3
@@ -79,10 +80,8 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
         flat = image.flatten(1, -3).flatten(2)
         return flat.gather(2, source.expand(-1, flat.shape[1], -1)).reshape(image.shape)
 
-    changes: dict[str, Any] = {name: fill(image) for name, image in frame.items() if name not in _KEPT}
-    extra = {name: changes.pop(name) for name in frame.extra}
-    layers = {name: fill(layer) for name, layer in frame.layers.items()}
-    return frame.replace(**changes, extra=extra, layers=layers), Void(void, divisor)
+    kept = {name: image for name, image in frame.items() if name in _KEPT}
+    return frame.replace(**dict.fromkeys(kept)).map(fill).replace(**kept), Void(void, divisor)
 
 
 def with_void(output: Output, frame: Frame, void: Void) -> Output:
@@ -125,17 +124,12 @@ def _covers(color: Tensor, nothing: Tensor) -> Tensor:
 
 def _divided(frame: Frame, alpha: Tensor) -> Frame:
     """The frame with straight light: not multiplied by its alpha."""
-    changes: dict[str, Any] = {name: image / alpha for name, image in frame.items() if name in RADIANCE}
-    changes["layers"] = {name: layer / alpha for name, layer in frame.layers.items()}
+    changes: dict[str, Any] = {}
     for name in ("albedo", "specular_albedo"):
         if (albedo := frame.buffer(name)) is not None:
             # A renderer's albedo is a mean over the pixel too.
             changes[name] = torch.where(alpha < 1, (albedo / alpha).clamp_max(1), albedo)
-    if frame.variance is not None:
-        changes["variance"] = frame.variance / alpha.square()
-    if frame.samples is not None:
-        changes["samples"] = scale_samples(frame.samples, (1 / alpha).expand(-1, 3, -1, -1))
-    return frame.replace(**changes)
+    return scaled(frame, 1 / alpha).replace(**changes)
 
 
 def _mirrored(void: Tensor) -> Tensor:

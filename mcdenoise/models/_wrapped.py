@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
@@ -26,10 +25,7 @@ def wrapped(frame: Frame) -> Frame:
     def wrap(image: Tensor) -> Tensor:
         return torch.cat([image[..., -margin:], image, image[..., :margin]], -1)
 
-    changes: dict[str, Any] = {name: wrap(image) for name, image in frame.items() if name != "view_projection"}
-    extra = {name: changes.pop(name) for name in frame.extra}
-    layers = {name: wrap(layer) for name, layer in frame.layers.items()}
-    return frame.replace(**changes, view_projection=None, extra=extra, layers=layers)
+    return frame.replace(view_projection=None).map(wrap)
 
 
 def unwrapped(output: Output, width: int) -> Output:
@@ -39,7 +35,4 @@ def unwrapped(output: Output, width: int) -> Output:
     def crop(image: Tensor) -> Tensor:
         return image[..., start : start + width].contiguous() if image.shape[-1] == width + 2 * start else image
 
-    stages = {name: crop(image) for name, image in output.stages.items()}
-    layers = {name: crop(layer) for name, layer in output.layers.items()}
-    alpha = None if output.alpha is None else crop(output.alpha)
-    return output._replace(image=crop(output.image), stages=stages, layers=layers, alpha=alpha)
+    return Output(*pytree.tree_map_only(Tensor, crop, tuple(output)))

@@ -24,7 +24,7 @@ class Exposed(Wrapper):
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure, and the statistics of the inner model for the exposed frame."""
         exposure = auto_exposure(frame.color)
-        exposed = _scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
+        exposed = scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
         return {**super().statistics(exposed), "exposure": exposure}
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
@@ -32,13 +32,14 @@ class Exposed(Wrapper):
         if "exposure" not in frame.statistics:
             frame = prepared(self, frame)
         exposure = frame.statistics["exposure"]
-        output, state = self.inner(_scaled(frame, exposure), state)
+        output, state = self.inner(scaled(frame, exposure), state)
         stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}
         layers = {name: layer / exposure for name, layer in output.layers.items()}
         return Output(output.image / exposure, stages, layers, output.alpha), state
 
 
-def _scaled(frame: Frame, factor: Tensor) -> Frame:
+def scaled(frame: Frame, factor: Tensor) -> Frame:
+    """The frame with all of its light multiplied by a factor, ``(B, 1, H, W)`` or ``(B, 1, 1, 1)``."""
     light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
     samples = None if frame.samples is None else scale_samples(frame.samples, factor)
     variance = None if frame.variance is None else frame.variance * factor.square()

@@ -122,11 +122,15 @@ class CachedShot:
                 parts[name] = torch.from_numpy(source[frames].astype(np.float32))
                 continue
             # Views only: the pixels are moved once, when they are copied.
-            image = turn(source[frames, :, rows, columns])
-            order = channels.get(name, range(image.shape[1]))
-            part = np.empty((image.shape[0], len(order), *image.shape[2:]), np.float32)
-            parts[name] = torch.from_numpy(np.stack([image[:, i] for i in order], 1, out=part))
+            parts[name] = copied(turn(source[frames, :, rows, columns]), channels.get(name))
         return parts
+
+
+def copied(image: Array, order: list[int] | None) -> Tensor:
+    """Copy channels of ``(T, C, H, W)`` in this order, by default all, as float32."""
+    channels = range(image.shape[1]) if order is None else order
+    part = np.empty((image.shape[0], len(channels), *image.shape[2:]), np.float32)
+    return torch.from_numpy(np.stack([image[:, i] for i in channels], 1, out=part))
 
 
 @dataclass(frozen=True)

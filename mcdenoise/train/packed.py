@@ -15,7 +15,7 @@ from torch import Tensor
 from mcdenoise.data.shards import ERROR, Shard, find_shards, open_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.train.cache import Array
+from mcdenoise.train.cache import Array, copied
 from mcdenoise.train.front import Front
 
 
@@ -95,12 +95,7 @@ class PackedShot:
         if self.front.wrappers:
             images |= self._processed(images)
         kept = {*self.front.parts, "reference", *self.buffers} & images.keys()
-        parts = {}
-        for name in kept:
-            image = turn(images[name].numpy())
-            order = channels.get(name, range(image.shape[1]))
-            parts[name] = torch.from_numpy(np.stack([image[:, i] for i in order], 1))
-        return parts
+        return {name: copied(turn(images[name].numpy()), channels.get(name)) for name in kept}
 
     def _processed(self, images: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What the front makes of each frame."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import write_json
 from mcdenoise.data.shards import ERROR, SUFFIX, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
@@ -94,7 +94,7 @@ def _claim(plan: TakePlan) -> None:
             raise InputError(
                 f"{plan.out}: expected takes with {key} {value}, found {found.get(key)}; choose another folder"
             )
-    write_text(about, json.dumps(plan.identity, indent=1) + "\n")
+    write_json(about, plan.identity)
 
 
 def _render(plan: TakePlan, number: int, path: Path) -> None:
