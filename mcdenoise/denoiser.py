@@ -294,9 +294,8 @@ class Denoiser:
             InputError: the chosen model cannot be made with the settings, or memory is insufficient.
         """
         if self.model is None:
-            cascade = self.alpha or bool(self._given)
             with torch.no_grad():
-                name, why = suitable_model(frame, still=self._frames == 1, cascade=cascade)
+                name, why = suitable_model(frame, still=self._frames == 1, cascade=bool(self._given))
             # Weights can be trained later, also if the caller infers only now.
             with timed("pick", self.device), torch.inference_mode(False), torch.enable_grad():
                 self._make(name)

@@ -134,11 +134,15 @@ def test_a_picked_model_obeys_the_arguments_of_the_denoiser() -> None:
     still(frame)
     assert still.report.model.startswith("oidn_tuned_exact: ")
     Denoiser().reset({"color"}, 3, (64, 96))
-    arguments: dict[str, Any]
-    for arguments in ({"alpha_min": 0.5}, {"alpha": True}):
-        denoiser = Denoiser(**arguments)
-        denoiser(frame)
-        assert denoiser.report.model.startswith("cascaded_v2: ")
+    historic = Denoiser(alpha_min=0.5)
+    historic(frame)
+    assert historic.report.model.startswith("cascaded_v2: ")
+    # Alpha rides along with any model.
+    plain, with_alpha = Denoiser(), Denoiser(alpha=True)
+    for denoiser in (plain, with_alpha):
+        denoiser.reset(frames=1)
+        denoiser(frame.replace(alpha=torch.ones_like(frame.color[:, :1])))
+    assert with_alpha.report.model == plain.report.model
     tiled = Denoiser(tile=64, precision="bfloat16")
     assert tiled.precision == "bfloat16"
     tiled(frame)

@@ -127,6 +127,10 @@ def test_the_default_is_the_model_of_the_package_and_arguments_have_optix_order(
     first = denoiser(bitmap, "albedo", "normals", mi.ScalarTransform4f(), "", "", "<root>")
     second = denoiser(bitmap, normals_ch="normals", albedo_ch="albedo")
     assert np.array_equal(np.array(first), np.array(second))
+    # Neither alpha nor tiles need another model.
+    for arguments in ({"denoise_alpha": True}, {"tile": 64}):
+        other = MitsubaDenoiser((WIDTH, HEIGHT), **arguments).denoiser
+        assert other._name == denoiser.denoiser._name
 
 
 def test_bitmaps_without_layers_keep_their_pixel_format(mi: Any) -> None:

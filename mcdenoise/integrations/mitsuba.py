@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
+from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Model
@@ -66,7 +66,7 @@ class MitsubaDenoiser:
         denoise_alpha: whether alpha, the second or fourth channel, is denoised with the kernels of the color;
             otherwise, and by methods without kernels, it is returned unchanged.
         model: as for :class:`mcdenoise.Denoiser`; by default ``"oidn_tuned"``, for features through a pixel
-            filter, or ``"cascaded_v3"`` with ``denoise_alpha`` or ``settings``, or the one that the weights are for.
+            filter, or ``"cascaded_v3"`` for settings of the history, or the one that the weights are for.
         device: device of torch; by default a GPU for the CUDA variants if torch has one, otherwise the CPU.
         precision: as for :class:`mcdenoise.Denoiser`.
         settings: its other arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
@@ -113,9 +113,8 @@ class MitsubaDenoiser:
         if device is None:
             cuda = str(self._mi.variant()).startswith("cuda") and torch.cuda.is_available()
             device = "cuda" if cuda else "cpu"
-        if model is None and "weights" not in settings:
-            model, _ = suitable_model(None, cascade=denoise_alpha or bool(settings))
         self.denoiser = Denoiser(model, device=device, precision=precision, **settings)
+        self.denoiser.pick(None)
         if not isinstance(model, nn.Module) and isinstance(self.denoiser.model, nn.Module):
             self.denoiser.model.requires_grad_(False)
 
