@@ -14,7 +14,7 @@ from mcdenoise import Denoiser, Frame, create_model
 
 # Central differences of smooth functions in float64: rounding is 1e-16 / 1e-6 of the value, truncation 1e-12.
 STEP, TOLERANCE = 1e-6, 1e-6
-COMPILED = ("mcdenoise.ops._fast", "mcdenoise.ops._numba", "mcdenoise.ops._triton", "torch")
+COMPILED = ("mcdenoise.ops._fast", "mcdenoise.ops._numba", "torch")
 
 
 def shot(size: tuple[int, int], frames: int = 3) -> list[dict[str, Tensor]]:

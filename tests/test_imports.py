@@ -77,8 +77,8 @@ ALLOWED: dict[str, set[str]] = {
 }
 OPS_KNOW = {"torch", "kornia"}
 # Fast backends are imported when one is chosen; `_backend` tests whether that is possible.
-FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy", "triton"}
-FAST_FORMS = ("mcdenoise.ops._numba", "mcdenoise.ops._triton")
+FAST_OPS_KNOW = OPS_KNOW | {"numba", "numpy"}
+FAST_FORMS = ("mcdenoise.ops._numba",)
 # Rooms in which a file still imports one that imports it.
 CIRCULAR: set[str] = set()
 # `from mcdenoise import Denoiser` leaves these alone: optional, slow to load, or of use to the command line only.
@@ -192,9 +192,7 @@ def test_no_import_goes_up(module: str) -> None:
         ("mcdenoise.ops._check", "import numpy", True),
         ("mcdenoise.ops._check", "import OpenImageIO as oiio", True),
         ("mcdenoise.ops._check", "import numba", True),
-        ("mcdenoise.ops._check", "import triton", True),
         ("mcdenoise.ops._numba._filter", "import numba", False),
-        ("mcdenoise.ops._triton._filter", "import triton.language as tl", False),
         ("mcdenoise.ops._numba._filter", "import OpenImageIO", True),
         ("mcdenoise.ops._check", "from mcdenoise.frame import Frame", True),
         ("mcdenoise.ops._check", "from ..frame import Frame", True),

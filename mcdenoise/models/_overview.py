@@ -103,7 +103,7 @@ def _overview(name: str, weights: str) -> ModelOverview:
 # The constructor is part of the cache key, because another model may be registered under the same name.
 @cache
 def _kmacs_per_pixel(name: str, _: object) -> float:
-    # The import loads Triton where it is installed, which takes 0.2 s.
+    # The import takes 0.2 s.
     from torch.utils.flop_counter import FlopCounterMode
 
     model = build_model(name)

@@ -1,11 +1,10 @@
-"""Which implementation of an op runs: the reference, or that of the same name in ``_numba/`` or ``_triton/``."""
+"""Which implementation of an op runs: the reference, or that of the same name in ``_numba/``."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import importlib.util
-import os
 import threading
 import warnings
 from collections.abc import Collection, Iterator, Sequence
@@ -16,11 +15,10 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-Backend = Literal["torch", "numba", "triton"]
+Backend = Literal["torch", "numba"]
 BACKENDS: tuple[Backend, ...] = get_args(Backend)
 
-_FOUND = {name: importlib.util.find_spec(name) is not None for name in ("numba", "triton")}
-_EXTRAS = {"numba": "fast", "triton": "gpu"}
+_FOUND = importlib.util.find_spec("numba") is not None
 # Pixels of a batch below which importing numba and calling it takes longer than the reference implementation does.
 _FEW_PIXELS = 8192
 
@@ -33,8 +31,6 @@ class _Used(threading.local):
 
 # Torch's compiler traces it, which it cannot do with a ContextVar.
 _used = _Used()
-# Triton's interpreter computes with the memory of any device, slowly: for tests.
-_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def check_backend(backend: str | None) -> None:
@@ -69,8 +65,8 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
 
     Args:
         backend: ``"torch"`` is plain torch, which runs everywhere and has derivatives of any order. ``"numba"`` is
-            compiled for the processor when it is first called (seconds; later processes load it from numba's cache),
-            ``"triton"`` likewise for an NVIDIA GPU. Without this the fastest is taken that can run.
+            compiled for the processor when it is first called (seconds; later processes load it from numba's cache).
+            Without this the fastest is taken that can run.
         strict: whether an op that cannot run in it raises, with the reason; otherwise that op runs in plain torch.
 
     Raises:
@@ -106,8 +102,6 @@ def _fastest(images: Sequence[Tensor]) -> Backend:
     """The backend that is fastest for images, of which the largest counts, if it can run."""
     if not images or torch.compiler.is_exporting():
         return "torch"
-    if images[0].device.type == "cuda":
-        return "triton"
     pixels = max(image.shape[:1].numel() * image.shape[2:].numel() for image in images)
     return "torch" if pixels < _FEW_PIXELS else "numba"
 
@@ -122,15 +116,11 @@ def _obstacle(backend: Backend, tensors: Sequence[Tensor], differentiable: bool,
         return "has no rule for torch.func, vmap or forward mode"
     for tensor in tensors:
         device = tensor.device
-        if backend == "numba" and device.type != "cpu":
+        if device.type != "cpu":
             return f"runs on the CPU, not on {device}"
-        if backend == "triton" and device.type != "cuda" and not (_INTERPRETED and device.type == "cpu"):
-            return f"runs on an NVIDIA GPU, not on {device}"
-        if device != tensors[0].device:
-            return f"needs all tensors on one device, and they are on {tensors[0].device} and {device}"
         if not differentiable and tensor.requires_grad and torch.is_grad_enabled():
             return "has no derivatives of this op"
-    return _missing(backend)
+    return _missing()
 
 
 def _is_transformed() -> bool:
@@ -140,24 +130,22 @@ def _is_transformed() -> bool:
     return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
-def _missing(backend: Backend) -> str:
-    """Why the package of a backend cannot be imported; empty if it can."""
+def _missing() -> str:
+    """Why numba cannot be imported; empty if it can."""
     # The compiler traces neither a cache nor an attempt to import.
-    if torch.compiler.is_compiling() and _FOUND[backend]:
+    if torch.compiler.is_compiling() and _FOUND:
         return ""
-    return _tried_import(backend)
+    return _tried_import()
 
 
 @functools.cache
-def _tried_import(backend: Backend) -> str:
+def _tried_import() -> str:
     try:
-        importlib.import_module(backend)
-        if backend == "numba":
-            # What all its kernels need is loaded, too, as the memory of the process may end here.
-            importlib.import_module("mcdenoise.ops._numba._runtime")
+        # With what all its kernels need, as the memory of the process may end here.
+        importlib.import_module("mcdenoise.ops._numba._runtime")
     except Exception as error:  # from a damaged file of settings to too little memory
         reason = f"cannot be imported ({' '.join(str(error).split()) or type(error).__name__})"
-        if _FOUND[backend]:
-            warnings.warn(f"{backend} {reason}: plain torch is used, which is slower", stacklevel=2)
-        return f"{reason}; install mcdenoise[{_EXTRAS[backend]}]"
+        if _FOUND:
+            warnings.warn(f"numba {reason}: plain torch is used, which is slower", stacklevel=2)
+        return f"{reason}; install mcdenoise[fast]"
     return ""

@@ -1,15 +1,15 @@
 """The dispatch of all ops: which implementation runs, and how it is differentiated.
 
 An op is a page with a contract and a reference implementation in torch, which is the truth. Where a fast backend can
-run and saves time, ``@op`` calls the function of the same name in the file of the same name in ``_numba/`` or
-``_triton/``. That function takes the arguments of the op by position, and may return ``NotImplemented`` for arguments
-that it does not support.
+run and saves time, ``@op`` calls the function of the same name in the file of the same name in ``_numba/``. That
+function takes the arguments of the op by position, and may return ``NotImplemented`` for arguments that it does not
+support.
 
 - Derivatives: a fast backend ``NAME`` beside which there is ``NAME_gradients`` is an operator with derivatives; or it
   calls ``NAME_gradients.operator``, which has them, and whose arguments ``NAME_gradients.adapted(plain)`` takes. Those
   are differentiated again by way of the reference. Any other is chosen only where no derivatives are asked for.
 - Under ``torch.func``, ``vmap`` and forward mode the reference runs: no fast backend has rules for them.
-- While a model is exported the reference runs, so that the exported graph needs neither numba nor Triton.
+- While a model is exported the reference runs, so that the exported graph does not need numba.
 - Under autocast nothing is rounded except where a contract says so: the reference consists of products and sums in
   place of matrix products.
 """
@@ -41,16 +41,16 @@ _loading = threading.RLock()
 
 
 def op(
-    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool | Backend = False
+    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool = False
 ) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
     """Make an op of its reference implementation.
 
     Args:
         backends: names of its fast backends.
         check: takes the arguments of the op, and raises for those that its contract refuses; run before any backend.
-        differentiable: whether the fast backends have derivatives, or which one of them has.
+        differentiable: whether the fast backends have derivatives.
     """
-    of_these = (backends if differentiable else ()) if isinstance(differentiable, bool) else (differentiable,)
+    of_these = backends if differentiable else ()
 
     def decorate(plain: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
         parameters = inspect.signature(plain).parameters.values()

@@ -28,7 +28,7 @@ def _check(
     check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
 
 
-@op("numba", "triton", check=_check, differentiable=True)
+@op("numba", check=_check, differentiable=True)
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,

@@ -30,7 +30,7 @@ def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
     kernel_size_of(sizes["T"], "kernel")
 
 
-@op("numba", "triton", check=_check, differentiable=True)
+@op("numba", check=_check, differentiable=True)
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
 
@@ -74,7 +74,7 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
     return _renormalized(total, kernel, kernel_size).to(image.dtype)
 
 
-@op("numba", "triton", check=_check, differentiable=True)
+@op("numba", check=_check, differentiable=True)
 def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Spread every pixel over its neighbours with a kernel of its own: the transpose of :func:`kernel_conv`.
 

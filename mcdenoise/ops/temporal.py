@@ -27,7 +27,7 @@ def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
     check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
 
 
-@op("numba", "triton", check=_check_motion)
+@op("numba", check=_check_motion)
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """The motion of each point of a static surface: its place in the previous frame minus its place now.
 
@@ -225,7 +225,7 @@ def check_accumulate(
     check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
 
 
-@op("numba", "triton", check=check_accumulate, differentiable="numba")
+@op("numba", check=check_accumulate, differentiable=True)
 def accumulate(
     color: Tensor,
     previous: Tensor,

@@ -56,7 +56,7 @@ def _check_incoming(
     check_shapes(**images, **({"limit": (limit, "B 1 1 1")} if isinstance(limit, Tensor) else {}))
 
 
-@op("numba", "triton", check=_check_incoming)
+@op("numba", check=_check_incoming)
 def incoming(
     color: Tensor,
     albedo: Tensor | None = None,
@@ -98,7 +98,7 @@ def _check_lights(root: Tensor) -> None:
     check_shapes(root=(root, "B 1 H W"))
 
 
-@op("numba", "triton", check=_check_lights)
+@op("numba", check=_check_lights)
 def lights(root: Tensor) -> Tensor:
     """Find the lights in one frame: blocks of 3x3 pixels that are alike and brighter than the window around them.
 
@@ -170,7 +170,7 @@ def _check_blend(
     )
 
 
-@op("numba", "triton", check=_check_blend)
+@op("numba", check=_check_blend)
 def blend(
     entering: Tensor,
     previous: Tensor,

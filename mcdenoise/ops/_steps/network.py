@@ -44,7 +44,7 @@ def network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -
     return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
 
 
-@op("numba", "triton")
+@op("numba")
 def buffers_input(
     image: Tensor,
     albedo: Tensor,
@@ -82,7 +82,7 @@ def buffers_input(
     return plain(network_input)(image, features, logarithms=logarithms)
 
 
-@op("numba", "triton")
+@op("numba")
 def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
     """Normal and depth as :func:`network_features` has them, to guide a filter.
 
@@ -97,7 +97,7 @@ def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) 
     return torch.cat([normal * 0.5 + 0.5, normalized_depth(depth, *scale)], 1)
 
 
-@op("numba", "triton")
+@op("numba")
 def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     """A near depth as the unit of depths, and the typical depth in that unit: the geometric mean of all hits.
 
@@ -179,7 +179,7 @@ def network_features(
     return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), fraction], 1)
 
 
-@op("numba", "triton")
+@op("numba")
 def gated_fusion(
     fine: Tensor,
     coarse: Tensor,
@@ -229,7 +229,7 @@ def gated_fusion(
     return fused if maximum is None else torch.expm1(torch.minimum(fused.clamp_min(0), maximum))
 
 
-@op("numba", "triton")
+@op("numba")
 def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None = None) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
@@ -255,7 +255,7 @@ def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: 
     return torch.minimum(fine * (wanted / found), most)
 
 
-@op("numba", "triton")
+@op("numba")
 def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
     """``F.softplus(x)`` in units of its own for each channel, as contiguous planes of at least float32.
 
