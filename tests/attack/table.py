@@ -151,7 +151,7 @@ COMMANDS = {
     "denoise pfm": Command("denoise still.pfm -o out --model joint_bilateral", ("still.pfm",), pictures),
     "denoise tif": Command("denoise still.tif -o out --model joint_bilateral", ("still.tif",), pictures),
     "denoise zip": Command(
-        "denoise frame0.zip -o out --model joint_bilateral", ("frame0.zip",), images, requires="numcodecs"
+        "denoise frame0.zip -o out --model joint_bilateral", ("frame0.zip",), images, requires="zarr"
     ),
     "denoise network": Command(NETWORK, ("shot", "weights.safetensors"), images),
     "denoise again": Command(SHOWN, ("shot", "out"), images),
@@ -180,7 +180,7 @@ COMMANDS = {
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
     "reader layers": Command("reader sequence layers", ("layers",), printed),
-    "reader zip": Command("reader sequence frame0.zip", ("frame0.zip",), printed, requires="numcodecs"),
+    "reader zip": Command("reader sequence frame0.zip", ("frame0.zip",), printed, requires="zarr"),
     "reader hdr": Command("reader sequence still.hdr", ("still.hdr",), printed),
     "reader png": Command("reader sequence still.png", ("still.png",), printed),
     "reader camera_matrices": Command("reader camera_matrices shot/inputs/camera_matrices.h", ("shot",), printed),

@@ -81,7 +81,7 @@ def build(folder: Path) -> None:
     for suffix in (".hdr", ".pfm", ".tif", ".png"):
         image = oiio.ImageBuf(frames[0].color[0].permute(1, 2, 0).numpy().copy())
         assert image.write(str(folder / f"still{suffix}")), oiio.geterror()
-    if importlib.util.find_spec("numcodecs"):
+    if importlib.util.find_spec("zarr"):
         write_zip(folder / "frame0.zip", frames[0])
     write_camera_matrices(folder / "shot/inputs/camera_matrices.h", cameras, "a wall")
     description = {"color_includes_albedo": True, "reference_noise": {"0": 0.01, "1": 0.02}}
