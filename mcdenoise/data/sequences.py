@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Sequential
@@ -16,12 +15,12 @@ from torch import Tensor
 
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import FORMATS, Window
-from mcdenoise.data.readers.bmfr import BmfrFolder, find_frames, is_bmfr, open_bmfr
+from mcdenoise.data.readers.bmfr import find_bmfr, open_bmfr
 from mcdenoise.data.readers.choice import parse_mapping
-from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.data.readers.names import find_files, group_files
-from mcdenoise.data.readers.noisebase import NoisebaseFiles, find_zips, open_noisebase
+from mcdenoise.data.readers.noisebase import find_zips, open_noisebase
 from mcdenoise.data.readers.opening import ColorSpace, open_files
+from mcdenoise.data.readers.source import Source
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -68,7 +67,7 @@ class Sequence:
     unused: Sequential[str] = field(repr=False)
     unknown: Sequential[str] = field(repr=False)
     lights: Sequential[str]
-    _source: BmfrFolder | NoisebaseFiles | RenderedFiles = field(repr=False)
+    _source: Source = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -90,7 +89,7 @@ class Sequence:
     @property
     def window(self) -> Window | None:
         """The window of all frames, if the files have data windows that differ; each is written in its own."""
-        return self._source.window if isinstance(self._source, RenderedFiles) else None
+        return self._source.window
 
     def part(self, numbers: Sequential[int]) -> Sequence:
         """Select some frames, ascending; how the values are read does not change."""
@@ -184,11 +183,6 @@ class Sequence:
         Raises:
             InputError: the name is invalid, or the files have such a layer already or have no layers.
         """
-        if not isinstance(self._source, RenderedFiles):
-            raise InputError(
-                f"{self.root}: expected files with layers to add '{name}' to, found the {self.layout} layout; "
-                "omit --output-layer: each result is a file of its own"
-            )
         self._source.check_output_layer(name)
 
     def write(
@@ -225,9 +219,6 @@ class Sequence:
         self._check(number)
         if output_layer is not None:
             self.check_output_layer(output_layer)
-        if not isinstance(self._source, RenderedFiles):
-            # This layout has neither alpha nor layers.
-            return self._source.write(out, number, image, full_float=full_float)
         return self._source.write(
             out, number, image, alpha=alpha, lights=lights, output_layer=output_layer, full_float=full_float
         )
@@ -269,24 +260,22 @@ def open_sequence(
     if not given:
         raise InputError("input: expected a folder, a file or a pattern, found nothing")
     where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
-    folder = _bmfr_folder(given)
-    found: list[str] = []
+    bmfr = find_bmfr(given)
+    gaps: list[str] = []
 
     def chosen(present: list[int]) -> list[int]:
-        numbers = _choose(given[0], present, frames)
-        found.extend(_gaps(present) if frames is None else [])
-        return numbers
+        gaps.extend(_gaps(present) if frames is None else [])
+        return _choose(given[0], present, frames)
 
-    source: BmfrFolder | NoisebaseFiles | RenderedFiles
-    if folder is not None and not mapping and not lights:
-        files = find_frames(folder) or {"color": {}}
-        source, layout = open_bmfr(folder, files, chosen(sorted(files["color"])), color_has_albedo), "bmfr"
+    source: Source
+    if bmfr is not None and not mapping and not lights:
+        source, layout = open_bmfr(*bmfr, chosen, color_has_albedo), "bmfr"
     elif zips := find_zips(given):
         if mapping or lights:
             raise InputError(f"{where}: expected neither --map nor --layers, found one: these arrays have their names")
         source, layout = open_noisebase(zips, chosen, where=where), "noisebase"
     else:
-        paths = find_files([folder] if folder is not None else given)
+        paths = find_files(given if bmfr is None else [bmfr[0]])
         if not paths:
             others = ", ".join(sorted({each.suffix for each in given[0].glob("*.*")})[:8]) if given[0].is_dir() else ""
             raise InputError(
@@ -303,7 +292,19 @@ def open_sequence(
             lights=lights,
             color_space=color_space,
         )
-    return _wrap(given[0], layout, source, found)
+    place = given[0].resolve()
+    alike = ("numbers", "size", "buffers", "reference_numbers", "color_has_albedo", "noise_seeds", "noisy", "table")
+    return Sequence(
+        root=given[0],
+        name=place.parent.name if place.name == "inputs" else place.name,
+        layout=layout,
+        warnings=[*gaps, *source.warnings],
+        unused=source.unused,
+        unknown=source.unknown,
+        lights=list(source.lights),
+        _source=source,
+        **{name: getattr(source, name) for name in alike},
+    )
 
 
 def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> list[int]:
@@ -320,26 +321,14 @@ def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> l
         InputError: nothing was found, or ``frames`` is invalid.
     """
     given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
-    folder = _bmfr_folder(given)
-    if folder is not None:
-        numbers = set((find_frames(folder) or {"color": {}})["color"])
+    if (bmfr := find_bmfr(given)) is not None:
+        numbers = set(bmfr[1]["color"])
     elif find_zips(given):
         return []
     else:
         groups, _ = group_files(find_files(given))
         numbers = {number for group in groups for number in group.files if number >= 0}
     return sorted(numbers if frames is None else numbers & set(parse_frames(frames)))
-
-
-def _bmfr_folder(given: Sequential[Path]) -> Path | None:
-    """The given folder, or its subfolder ``inputs``, if it has the BMFR layout."""
-    (path, *more) = given
-    if more or not os.path.isdir(path):
-        return None
-    for folder in (path, path / "inputs"):
-        if os.path.isdir(folder) and is_bmfr(folder):
-            return folder
-    return None
 
 
 def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
@@ -383,15 +372,10 @@ def parse_frames(text: str, name: str = "frames") -> list[int]:
 
 
 def _choose(folder: Path, present: list[int], frames: str | None) -> list[int]:
-    if frames is not None:
-        chosen = parse_frames(frames)
-        absent = sorted(set(chosen) - set(present))
-        if absent:
-            raise InputError(
-                f"{folder}: expected frame {absent[0]}, found frames {_summary(present)}; choose among these"
-            )
-        return chosen
-    return present
+    chosen = present if frames is None else parse_frames(frames)
+    if absent := sorted(set(chosen) - set(present)):
+        raise InputError(f"{folder}: expected frame {absent[0]}, found frames {_summary(present)}; choose among these")
+    return chosen
 
 
 def _gaps(present: list[int]) -> list[str]:
@@ -406,27 +390,3 @@ def _gaps(present: list[int]) -> list[str]:
 
 def _summary(numbers: list[int]) -> str:
     return f"{numbers[0]} to {numbers[-1]}"
-
-
-def _wrap(root: Path, layout: str, source: BmfrFolder | NoisebaseFiles | RenderedFiles, gaps: list[str]) -> Sequence:
-    name = root.resolve().name
-    if name == "inputs":
-        name = root.resolve().parent.name
-    return Sequence(
-        root=root,
-        name=name,
-        layout=layout,
-        numbers=source.numbers,
-        size=source.size,
-        buffers=source.buffers,
-        reference_numbers=source.reference_numbers,
-        color_has_albedo=source.color_has_albedo,
-        noise_seeds=source.noise_seeds,
-        noisy=source.noisy if isinstance(source, BmfrFolder) else frozenset({"color"}),
-        table=source.table,
-        warnings=[*gaps, *source.warnings],
-        unused=source.unused,
-        unknown=source.unknown if isinstance(source, RenderedFiles) else (),
-        lights=list(source.lights) if isinstance(source, RenderedFiles) else [],
-        _source=source,
-    )

@@ -184,7 +184,7 @@ def test_bmfr_refuses_files_without_color(bmfr: Path, channels: dict[str, np.nda
 def test_bmfr_refuses_a_buffer_of_other_pixels(bmfr: Path) -> None:
     write(bmfr / "albedo0.exr", part("RGB", dataWindow=window(3, -2)))
     assert read_exr_header(bmfr / "albedo0.exr").origin == (3, -2)
-    with pytest.raises(InputError, match="begins at 0, 0 like that of the first color file, found -2, 3"):
+    with pytest.raises(InputError, match=r"albedo0\.exr: .*pixels at -2, 3"):
         open_sequence(bmfr)
     # All of them there is a crop, and well.
     for path in bmfr.iterdir():

@@ -289,10 +289,6 @@ def _no_matrix_for_the_last_frame(inputs: Path) -> None:
     write_camera_matrices(inputs / "camera_matrices.h", fewer)
 
 
-def _alpha(inputs: Path) -> None:
-    _rewrite(inputs / "color1.exr", lambda image: np.concatenate([image, image[..., :1]], axis=2), [*RGB, "A"])
-
-
 def _without_albedo(inputs: Path) -> None:
     for path in inputs.glob("albedo*.exr"):
         path.unlink()
@@ -316,13 +312,12 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda inputs: _rewrite(inputs / "reference1.exr", lambda image: image[1:], RGB),
         r"reference1\.exr: expected 24 x 20",
     ),
-    "alpha": (_alpha, r"color1\.exr: expected 3 channels for buffer 'color', found 4 \(R, G, B, A\)"),
     "depth in three channels": (
         lambda inputs: _rewrite(inputs / "depth0.exr", lambda image: image.repeat(3, axis=2), RGB),
         r"depth0\.exr: expected 1 channels",
     ),
     "too few matrices": (_no_matrix_for_the_last_frame, "expected a matrix for frame 3, found 3"),
-    "no EXR": (lambda inputs: (inputs / "albedo3.exr").write_bytes(b"hello"), r"albedo3\.exr: expected an EXR image"),
+    "no EXR": (lambda inputs: (inputs / "albedo3.exr").write_bytes(b"hello"), r"albedo3\.exr: expected an image"),
     "twice": (
         lambda inputs: shutil.copy(inputs / "color1.exr", inputs / "color01.exr"),
         r"found color01\.exr and color1\.exr",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -54,8 +54,8 @@ class Choice:
     warnings: list[str] = field(default_factory=list)
 
 
-# Reads some rows of a layer in the first frame.
-Read: TypeAlias = Callable[[Layer, slice], Image]
+# Reads some rows of layers in the first frame.
+Read: TypeAlias = Callable[[Sequence[Layer], slice], Mapping[Layer, Image]]
 
 
 def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> Choice:
@@ -195,7 +195,7 @@ def _choose_best(choice: Choice, buffer: str, candidates: Sequence[tuple[int, La
     if not best:
         return
     if len(best) > 1:
-        images = [read(layer, _ALL) for layer in best]
+        images = [*read(best, _ALL).values()]
         ranks = [_rank_by_points(choice, buffer, image, read) for image in images]
         right = [layer for layer, rank in zip(best, ranks, strict=True) if rank == min(ranks)]
         alike = all(np.array_equal(image, images[0], equal_nan=True) for image in images)
@@ -218,7 +218,7 @@ def _rank_by_points(choice: Choice, buffer: str, image: Image, read: Read) -> in
     """0 for positions that a camera sees at their pixels and a depth along its axis, 1 for a distance, 2 for others."""
     if buffer != "position" and (buffer != "depth" or "position" not in choice.layers):
         return 2
-    position = (image if buffer == "position" else read(choice.layers["position"], _ALL))[..., :3]
+    position = (image if buffer == "position" else _whole(choice.layers["position"], read))[..., :3]
     if position.shape[:2] != image.shape[:2]:
         return 2
     hit = np.isfinite(position).all(-1) & (position != 0).any(-1)
@@ -238,19 +238,23 @@ def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
     if not others:
         return []
     # Compare a few rows first, since every read decompresses all layers of these rows.
-    first, *rest = _together(read, [color, *others], _LOWEST)
-    alike = [layer for layer, pixels in zip(others, rest, strict=True) if np.array_equal(first, pixels, equal_nan=True)]
-    if not alike:
-        return []
-    whole = read(color, _ALL)[..., :3]
-    height, numbers = len(whole), max(1, whole[0].size * len(alike))
-    rows = max(16, _AT_ONCE // numbers)
-    for part in (slice(top, top + rows) for top in range(0, height, rows)):
-        pixels_of = zip(alike, _together(read, alike, part), strict=True)
-        alike = [layer for layer, pixels in pixels_of if np.array_equal(pixels, whole[part], equal_nan=True)]
-        if not alike:
-            break
+    first = read([color, *others], _LOWEST)
+    alike = [layer for layer in others if _equal(first[layer], first[color])]
+    height = len(first[color])
+    whole = _whole(color, read) if alike else first[color]
+    rows = max(16, _AT_ONCE // max(1, whole[0].size * len(alike)))
+    for part in (slice(top, top + rows) for top in range(0, len(whole), rows) if alike and len(whole) > height):
+        pixels = read(alike, part)
+        alike = [layer for layer in alike if _equal(pixels[layer], whole[part])]
     return alike
+
+
+def _whole(layer: Layer, read: Read) -> Image:
+    return read([layer], _ALL)[layer]
+
+
+def _equal(one: Image, other: Image) -> bool:
+    return np.array_equal(one[..., :3], other[..., :3], equal_nan=True)
 
 
 def _conversions(color: Layer, strangers: Sequence[Layer], read: Read) -> dict[Layer, Array]:
@@ -263,18 +267,13 @@ def _conversions(color: Layer, strangers: Sequence[Layer], read: Read) -> dict[L
     }
     if not matrices or not color.is_color:
         return {}
-    light = read(color, _ALL)[..., :3]
+    pixels = read([color, *matrices], _ALL)
+    light = pixels[color][..., :3]
     with np.errstate(invalid="ignore", over="ignore"):
         expected = {layer: light @ matrix.T for layer, matrix in matrices.items()}
-        off = {layer: np.abs(read(layer, _ALL)[..., :3] - each) for layer, each in expected.items()}
+        off = {layer: np.abs(pixels[layer][..., :3] - each) for layer, each in expected.items()}
         near = {layer: each <= _SAME_COLOR * np.abs(light).sum(-1, keepdims=True) for layer, each in off.items()}
     return {layer: matrices[layer] for layer, each in near.items() if light.any() and each.mean() > 1 - _SAME_COLOR}
-
-
-def _together(read: Read, layers: Sequence[Layer], rows: slice) -> list[Image]:
-    """Some rows of several layers of one part, in a single read."""
-    every = replace(layers[0], channels=tuple(name for layer in layers for name in layer.channels[:3]))
-    return np.split(read(every, rows), len(layers), -1)
 
 
 def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
@@ -283,8 +282,8 @@ def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str,
     directions: list[Layer] = []
     points: list[Layer] = []
     named_already = {"normal", "position"} <= {*choice.layers, *mapping}
-    for layer in [] if named_already else [each for each in strangers if each.components == ("x", "y", "z")]:
-        vectors = read(layer, _ALL)
+    triples = [] if named_already else [each for each in strangers if each.components == ("x", "y", "z")]
+    for layer, vectors in read(triples, _ALL).items():
         if is_direction(vectors):
             directions.append(layer)
         elif fit_camera(vectors, (vectors != 0).any(-1)) is not None:

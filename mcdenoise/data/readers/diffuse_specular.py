@@ -19,53 +19,12 @@ import numpy as np
 
 from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import Light, color_of, find_parts
+from mcdenoise.data.readers.lights import KNOWN, PASSES, Light, color_of, difference, find_parts, is_same
 from mcdenoise.light import LARGEST_RADIANCE
 
 DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission", "specular_albedo"
 # Optional buffers that few methods use and that are slow to read.
 LIGHT_PARTS = frozenset({DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO, "samples"})
-# Layers of known renderers: diffuse light, all other light, the color of glossy reflection.
-_RENDERERS: tuple[tuple[tuple[str, ...], tuple[str, ...], str], ...] = (
-    (
-        ("DiffDir", "DiffInd"),
-        ("GlossDir", "GlossInd", "TransDir", "TransInd", "VolumeDir", "VolumeInd", "Emit", "Env"),
-        "GlossCol",
-    ),
-    (
-        ("Diffuse Direct", "Diffuse Indirect"),
-        (
-            *("Glossy Direct", "Glossy Indirect", "Transmission Direct", "Transmission Indirect"),
-            *("Volume Direct", "Volume Indirect", "Emission", "Environment"),
-        ),
-        "Glossy Color",
-    ),
-    (
-        ("diffuse_direct", "diffuse_indirect", "sss_direct", "sss_indirect"),
-        (
-            *("specular_direct", "specular_indirect", "coat_direct", "coat_indirect", "sheen_direct", "sheen_indirect"),
-            *("transmission_direct", "transmission_indirect", "volume_direct", "volume_indirect"),
-            *("emission", "background"),
-        ),
-        "specular_albedo",
-    ),
-    (
-        ("directDiffuse", "indirectDiffuse", "subsurface"),
-        ("directSpecular", "indirectSpecular", "transmissive", "emissive"),
-        "",
-    ),
-    (
-        ("DIRECT_DIFFUSE", "INDIRECT_DIFFUSE"),
-        ("DIRECT_GLOSSY", "INDIRECT_GLOSSY", "INDIRECT_SPECULAR", "EMISSION"),
-        "",
-    ),
-)
-_KNOWN = {title for diffuse, others, _ in _RENDERERS for title in (*diffuse, *others)}
-# Half floats round light, the color that it was divided by, and the sum, by 2^-11 each: allow for four roundings. Near
-# 0 the spacing is 2^-24.
-_ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
-# Largest fraction of pixels that do not add up, such as those brighter than the largest half float.
-_MOST_OFF = 1e-3
 # Every so manyth column is looked at to find out which layers are parts.
 _STEP = 8
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
@@ -91,73 +50,42 @@ class Split:
         return frozenset(self.parts) | ({SPECULAR_ALBEDO} if self.specular_albedo is not None else frozenset())
 
     @property
-    def layers(self) -> dict[str, Layer]:
-        """Every layer to read, by a key for :meth:`buffers`."""
-        lights = [light for own in self.parts.values() for light in own]
-        keyed = {f"light {i} {j}": each for i, light in enumerate(lights) for j, each in enumerate(light.layers)}
-        return keyed | ({} if self.specular_albedo is None else {SPECULAR_ALBEDO: self.specular_albedo})
+    def layers(self) -> set[Layer]:
+        """Every layer to read."""
+        own = {layer for lights in self.parts.values() for light in lights for layer in light.layers}
+        return own | (set() if self.specular_albedo is None else {self.specular_albedo})
 
-    def sums(self, images: Mapping[str, Image]) -> dict[str, Image]:
+    def sums(self, images: Mapping[Layer, Image]) -> dict[str, Image]:
         """The parts, ``(H, W, 3)`` by buffer, from the images of :attr:`layers`."""
-        lights, number = {}, 0
-        for name, own in self.parts.items():
-            total: Image = np.zeros((), np.float32)
-            for light in own:
-                found = [images[f"light {number} {j}"] for j in range(len(light.layers))]
-                total = total + light.radiance(found)
-                number += 1
-            lights[name] = total
-        return lights
+        return {
+            name: sum((each.radiance(images) for each in own[1:]), own[0].radiance(images))
+            for name, own in self.parts.items()
+        }
 
-    def without_strangers(self, images: Mapping[str, Image], color: Image) -> Split:
+    def without_strangers(self, images: Mapping[Layer, Image], color: Image) -> Split:
         """The same without lights that are not in the color, such as the sky of a transparent film, by their values."""
         lights = {f"{name} {i}": each for name, own in self.parts.items() for i, each in enumerate(own)}
-        pixels = {}
-        for number, (name, light) in enumerate(lights.items()):
-            found = [images[f"light {number} {j}"] for j in range(len(light.layers))]
-            pixels[name] = light.radiance(found)[:, ::_STEP].reshape(-1, 3)
+        pixels = {name: light.radiance(images)[:, ::_STEP].reshape(-1, 3) for name, light in lights.items()}
         kept = find_parts(color[:, ::_STEP].reshape(-1, 3), pixels, {})
         parts = {name: tuple(lights[n] for n in kept if n.startswith(f"{name} ")) for name in self.parts}
         return replace(self, parts=parts) if all(parts.values()) else self
 
-    def off(self, sums: Mapping[str, Image], color: Image) -> tuple[float, float]:
-        """Apply :func:`off` to the parts."""
-        return off(sums, color, count=1 + sum(len(own) for own in self.parts.values()))
+    def difference(self, sums: Mapping[str, Image], color: Image) -> float:
+        """The fraction of the pixels in which the parts do not add up to a color."""
+        total: Image = np.asarray(sum(sums.values()))
+        return difference(total, color, 1 + sum(len(own) for own in self.parts.values()))
 
-    def buffers(self, images: Mapping[str, Image], color: Image) -> dict[str, Image] | None:
+    def buffers(self, images: Mapping[Layer, Image], color: Image) -> dict[str, Image] | None:
         """The buffers of a frame, in their legal ranges; ``None`` if the parts do not add up to its color."""
         sums = self.sums(images)
-        if not adds_up(self.off(sums, color)):
+        if not is_same(self.difference(sums, color)):
             return None
         # Invalid pixels of the color are repaired later; the parts only need to be finite there.
         found = {name: np.clip(np.nan_to_num(each), 0, LARGEST_RADIANCE) for name, each in sums.items()}
         if self.specular_albedo is not None:
-            found[SPECULAR_ALBEDO] = np.clip(np.nan_to_num(images[SPECULAR_ALBEDO], posinf=1, neginf=0), 0, 1)
+            albedo = np.nan_to_num(images[self.specular_albedo][..., :3], posinf=1, neginf=0)
+            found[SPECULAR_ALBEDO] = np.clip(albedo, 0, 1)
         return found
-
-
-def off(sums: Mapping[str, Image], color: Image, *, count: int) -> tuple[float, float]:
-    """How far parts are from adding up to a color, beyond the rounding of half floats.
-
-    Args:
-        sums: ``(H, W, 3)`` each part.
-        color: ``(H, W, 3)``.
-        count: number of images that were rounded.
-
-    Returns:
-        The fraction of the pixels that do not add up, and the light of all parts over that of the color.
-    """
-    total: Image = np.asarray(sum(sums.values()))
-    known = (np.isfinite(total) & np.isfinite(color)).all(-1)
-    total, color = total[known], color[known]
-    far = np.abs(total - color) > _ROUNDING * np.maximum(np.abs(total), np.abs(color)) + count * _SMALLEST_HALF
-    light = float(np.sum(color, dtype=np.float64))
-    return float(far.any(-1).mean()) if known.any() else 1.0, float(np.sum(total, dtype=np.float64)) / (light or 1)
-
-
-def adds_up(off: tuple[float, float]) -> bool:
-    """Whether the result of :meth:`Split.off` is within rounding."""
-    return off[0] <= _MOST_OFF
 
 
 def find_splits(layers: Sequence[Layer], color: Layer, asked: Mapping[str, Layer]) -> list[Split]:
@@ -177,7 +105,7 @@ def find_splits(layers: Sequence[Layer], color: Layer, asked: Mapping[str, Layer
     for layer in own:
         titles.setdefault(layer.title, layer)
     found: list[Split] = []
-    for diffuse, others, gloss in _RENDERERS:
+    for diffuse, others, gloss in PASSES:
         parts = {
             name: tuple(Light((titles[t], *color_of(titles[t], own))) for t in names if t in titles)
             for name, names in ((DIFFUSE, diffuse), (SPECULAR, others))
@@ -199,4 +127,4 @@ def _says(layer: Layer, name: str) -> bool:
     """Whether a layer's name ends with a buffer's name: ``diffuse``, ``shot_diffuse``, ``shotDiffuse``."""
     wanted = name.split("_")
     words = [word.lower() for word in _WORD.findall(layer.title)]
-    return layer.title not in _KNOWN - {EMISSION} and words[-len(wanted) :] == wanted
+    return layer.title not in KNOWN - {EMISSION} and words[-len(wanted) :] == wanted

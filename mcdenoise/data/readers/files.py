@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,17 +15,18 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_channels, read_image_header
+from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_image_header
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import Split
-from mcdenoise.data.readers.layers import GREY, Layer
-from mcdenoise.data.readers.lights import Light, is_light, keeps, kept_together, stored
+from mcdenoise.data.readers.layers import GREY, Layer, read_layers
+from mcdenoise.data.readers.lights import is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.samples import SampleLayers
+from mcdenoise.data.readers.source import Source
 from mcdenoise.data.readers.transfer import decode
-from mcdenoise.data.readers.values import Row, nothing_hit
+from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
 from mcdenoise.motion import USUAL_MOTION, Convention, convert
@@ -39,29 +40,29 @@ _LOSSY = 1e-3
 
 
 @dataclass
-class RenderedFiles:
-    """Frames of one shot; made by :func:`open_files`.
+class RenderedFiles(Source):
+    """Frames of one shot; made by :func:`mcdenoise.data.readers.opening.open_files`.
 
     Args:
         groups: the kinds of files.
         parts: the parts of the first file of each kind.
-        numbers: frames in use, ascending.
         choice: the layer of each buffer.
-        lights: additive layers of radiance, which are denoised with the color, by name.
         cameras: contents of a ``camera_matrices.h`` beside the files.
-        color_has_albedo: whether the radiance includes the albedo.
+        encoded_normals: whether normals are stored as ``n / 2 + 1 / 2``.
+        motion: how motion is stored.
+        camera_convention: how the matrices of ``cameras`` are stored, see :func:`mcdenoise.motion.read_as`.
+        positions_of_camera: whether positions are in the space of the camera, and brought to the world.
+        has_camera: whether a camera can be found for each frame.
+        drops_positions: whether positions tell no more than a depth, or nothing.
         split: the layers of diffuse and specular light, if they add up to the color.
         samples: the layers of single samples, if their mean is the color.
-        window: the smallest window with the data windows of all colors, if there is one that differs from another.
+        kept: layers of some files, which need not be read again while a shot is being opened.
     """
 
     groups: Sequence[FileGroup]
     parts: Sequence[tuple[Part, ...]]
-    numbers: list[int]
     choice: Choice
-    lights: Mapping[str, Light]
     cameras: CameraMatrices | None = None
-    color_has_albedo: bool = True
     encoded_normals: bool = False
     motion: Convention = USUAL_MOTION
     camera_convention: str = ""
@@ -70,10 +71,9 @@ class RenderedFiles:
     drops_positions: bool = False
     split: Split | None = None
     samples: SampleLayers | None = None
-    window: Window | None = None
-    table: list[Row] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    noise_seeds: int = 1
+    kept: dict[tuple[Path, Layer], Image] = field(default_factory=dict)
+    # Whether a camera is found from positions where none is given.
+    fits_cameras: ClassVar[bool] = True
 
     @property
     def size(self) -> tuple[int, int]:
@@ -83,11 +83,7 @@ class RenderedFiles:
     @property
     def buffers(self) -> frozenset[str]:
         """Names of the buffers that every frame has."""
-        present = {
-            name
-            for name, layer in self.choice.layers.items()
-            if all(number in self.groups[layer.group].files for number in self.numbers)
-        }
+        present = {name for name, layer in self.choice.layers.items() if all(self.has(layer, n) for n in self.numbers)}
         if len(self.choice.layers["color"].channels) > 3:
             present.add("alpha")
         if self.window is not None:
@@ -98,11 +94,8 @@ class RenderedFiles:
             present.add("view_projection")
         if self.drops_positions:
             present -= {"position", "view_projection"}
-        if self.split is not None:
-            present |= self.split.names
-        if self.samples is not None:
-            present.add("samples")
-        return frozenset(present)
+        present |= frozenset() if self.split is None else self.split.names
+        return frozenset(present | (set() if self.samples is None else {"samples"}))
 
     @property
     def folders(self) -> set[Path]:
@@ -112,35 +105,32 @@ class RenderedFiles:
     @property
     def unused(self) -> list[str]:
         """Layers that look like buffers but are not used."""
-        lit = self._lit
-        return [layer.place for layer in self.choice.unused if layer not in lit]
+        return [layer.place for layer in self.choice.unused if layer not in self._further]
 
     @property
     def unknown(self) -> list[str]:
         """Layers with unknown names that the user has not requested."""
-        lit = self._lit
-        return [layer.place for layer in self.choice.unknown if layer not in lit and not is_light(layer)]
+        return [layer.place for layer in self.choice.unknown if layer not in self._further and not is_light(layer)]
 
     @property
-    def _lit(self) -> set[Layer]:
-        """Layers that are used as light or as its color."""
-        of_split = [] if self.split is None else self.split.layers.values()
-        return {*(layer for light in self.lights.values() for layer in light.layers), *of_split}
+    def _further(self) -> set[Layer]:
+        """The layers of light and of samples, and the colors that light is divided by."""
+        found = {layer for light in self.lights.values() for layer in light.layers}
+        found |= set() if self.split is None else self.split.layers
+        return found | (set() if self.samples is None else self.samples.layers)
 
     @property
     def reference_numbers(self) -> list[int]:
         """Frames in use that have a reference."""
         layer = self.choice.layers.get("reference")
-        return [] if layer is None else [n for n in self.numbers if n in self.groups[layer.group].files]
+        return [] if layer is None else [number for number in self.numbers if self.has(layer, number)]
 
     def frame_files(self, number: int) -> list[Path]:
         """The files of one frame with layers in use, without files that hold only a reference."""
-        used = {layer.group for name, layer in self.choice.layers.items() if name != "reference"}
-        used |= {layer.group for layer in (*self.choice.written, *self._lit)}
-        used |= {layer.group for layer in (self.samples.layers.values() if self.samples else ())}
-        own = [self.groups[group].files[number] for group in used if number in self.groups[group].files]
+        used = {layer for name, layer in self.choice.layers.items() if name != "reference"}
+        groups = {layer.group for layer in {*used, *self.choice.written, *self._further} if self.has(layer, number)}
         cameras = [folder / MATRICES for folder in self.folders] if self.cameras is not None else []
-        return own + [path for path in cameras if path.is_file()]
+        return [self.groups[group].files[number] for group in groups] + [path for path in cameras if path.is_file()]
 
     def metadata(self, number: int) -> Metadata:
         """Attributes of one frame's color file."""
@@ -148,45 +138,39 @@ class RenderedFiles:
 
     def reference(self, number: int) -> Tensor:
         """Read the reference of one frame that has one."""
-        return _tensor(self.read(number, {"reference": self.choice.layers["reference"]})["reference"][..., :3])
+        return as_tensor(self.read_buffers(number, ["reference"])["reference"])
 
     def frame(
         self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
         split = self.split if buffers is None or self.split is None or self.split.names & set(buffers) else None
-        wanted = {
-            name: layer
-            for name, layer in self.choice.layers.items()
-            if number in self.groups[layer.group].files and (reference or name != "reference")
-        }
         samples = self.samples if buffers is None or "samples" in buffers else None
-        wanted |= {} if split is None else split.layers
-        wanted |= {} if samples is None else samples.layers
-        wanted |= {f"{name} {i}": each for name, own in self.lights.items() for i, each in enumerate(own.layers)}
-        images = self.read(number, wanted)
-        lights = {
-            name: _without_lossy_black(own.radiance([images.pop(f"{name} {i}") for i in range(len(own.layers))]))
-            for name, own in self.lights.items()
-        }
+        names = [
+            name
+            for name, layer in self.choice.layers.items()
+            if self.has(layer, number) and (reference or name != "reference")
+        ]
+        wanted = {layer for light in self.lights.values() for layer in light.layers}
+        wanted |= (set() if split is None else split.layers) | (set() if samples is None else samples.layers)
+        pixels = self.read(number, [*wanted, *(self.choice.layers[name] for name in names)])
+        images = {name: self.as_buffer(number, name, pixels[self.choice.layers[name]]) for name in names}
+        lights = {name: _without_lossy_black(light.radiance(pixels)) for name, light in self.lights.items()}
         if split is not None:
-            read = {key: images.pop(key) for key in split.layers}
-            parts = split.buffers(read, images["color"][..., :3])
+            parts = split.buffers(pixels, images["color"][..., :3])
             if parts is None:
                 warnings.warn(
                     f"frame {number}: {', '.join(sorted(split.parts))} do not add up to the color as in the first "
                     "frame; not used",
                     stacklevel=2,
                 )
-            images |= {} if parts is None else parts
-        several = None if samples is None else samples.samples({key: images.pop(key) for key in samples.layers})
-        frame = self._as_frame(number, images, lights)
-        if several is None:
-            return frame
-        single = torch.from_numpy(several)[None]
-        if not self.color_has_albedo and frame.albedo is not None:
+            images |= parts or {}
+        single = None if samples is None else torch.from_numpy(samples.samples(pixels))[None]
+        del pixels
+        frame = self.as_frame(number, images, lights)
+        if single is not None and not self.color_has_albedo and frame.albedo is not None:
             single = scale_samples(single, frame.albedo)
-        return frame.replace(samples=single)
+        return frame if single is None else frame.replace(samples=single)
 
     def check_output_layer(self, name: str) -> None:
         """See :meth:`mcdenoise.data.Sequence.check_output_layer`."""
@@ -237,7 +221,7 @@ class RenderedFiles:
             files[group] |= channels
         for group in {layer.group, *files}:
             source, ours = self.groups[group].files[number], group == layer.group
-            target = out / source.name
+            target = out / self.target(source)
             write_like(
                 *(source, target, self._cropped(source, files[group])),
                 added={key[1]: pixels for key, pixels in self._cropped(source, inside).items()} if ours else {},
@@ -246,7 +230,11 @@ class RenderedFiles:
                 full_float=full_float,
                 stored=self.parts[group][0],
             )
-        return out / self.file(layer, number).name
+        return out / self.target(self.file(layer, number))
+
+    def target(self, source: Path) -> str:
+        """The name of the file that is written for one of the color, of light or of alpha."""
+        return source.name
 
     def _cropped(self, path: Path, channels: dict[tuple[int, str], Image]) -> dict[tuple[int, str], Image]:
         """The pixels of channels in the data windows of a file."""
@@ -257,19 +245,18 @@ class RenderedFiles:
 
     def _lights(self, number: int, radiances: Mapping[str, Image]) -> dict[int, dict[tuple[int, str], Image]]:
         """For each kind of file, the channels of its layers of light for given denoised radiances."""
-        if not radiances:
-            return {}
-        colors = self.read(
-            number, {name: self.lights[name].layers[1] for name in radiances if self.lights[name].layers[1:]}
-        )
-        held = kept_together(radiances, {name: keeps(colors.get(name)) for name in radiances})
+        divisors = {name: self.lights[name].color for name in radiances}
+        pixels = self.read(number, [layer for layer in divisors.values() if layer is not None])
+        colors = {name: None if layer is None else pixels[layer][..., :3] for name, layer in divisors.items()}
+        held = kept_together(radiances, {name: keeps(color) for name, color in colors.items()}) if radiances else {}
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         for name, radiance in held.items():
-            layer, pixels = self.lights[name].layers[0], stored(radiance, colors.get(name))
-            files[layer.group] |= {(layer.part, each): pixels[..., i] for i, each in enumerate(layer.channels[:3])}
+            layer, planes = self.lights[name].layers[0], stored(radiance, colors[name])
+            files[layer.group] |= {(layer.part, each): planes[..., i] for i, each in enumerate(layer.channels[:3])}
         return files
 
-    def _as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
+    def as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
+        """A frame of stored images, which are converted to this package's conventions."""
         color = images["color"]
         if color.shape[2] > 3:
             images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
@@ -283,7 +270,7 @@ class RenderedFiles:
             own = self.window_of(self.choice.layers["color"], number)
             inside = self.window.of(np.ones((*own.size, 1), np.float32), own)
             images["mask"] = np.minimum(images.get("mask", inside), inside)
-        seen = seen_of(images)
+        seen = ~nothing_hit(images["depth"]) if "depth" in images else None
         if "albedo" in images:
             images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
             if not self.color_has_albedo:
@@ -298,9 +285,9 @@ class RenderedFiles:
             if seen is not None and motion.any():
                 # Renderers that track surfaces write 0 where there is none, even if the camera moves.
                 images["motion"] = np.where(seen | (motion != 0), motion, np.float32(np.inf))
-        matrix = self.camera(number, images, seen)
+        matrix = self.camera(number, images)
         if matrix is not None and "position" in images:
-            known = hit(images, seen)
+            known = self.known(images)
             position = np.where(known[..., None], images["position"], 0)
             # In double precision, without converting all positions to it at once.
             w = np.einsum("hwc,c->hw", position, matrix[:3, 3]) + matrix[3, 3]
@@ -310,20 +297,27 @@ class RenderedFiles:
             seen = ~nothing_hit(images["depth"])
         if self.drops_positions or matrix is None:
             images.pop("position", None)
-        buffers: dict[str, Any] = {name: _tensor(image) for name, image in images.items() if name in BUFFERS}
+        buffers: dict[str, Any] = {name: as_tensor(image) for name, image in images.items() if name in BUFFERS}
         if matrix is not None and not self.drops_positions:
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
         if seen is not None:
-            buffers["depth"] = _tensor(np.where(seen, images["depth"], np.inf))
-        return Frame(**buffers, layers={name: _tensor(radiance) for name, radiance in lights.items()})
+            buffers["depth"] = as_tensor(np.where(seen, images["depth"], np.inf))
+        return Frame(**buffers, layers={name: as_tensor(radiance) for name, radiance in lights.items()})
 
-    def camera(self, number: int, images: Mapping[str, Image], seen: Mask | None) -> Array | None:
+    def known(self, images: Mapping[str, Image]) -> Mask:
+        """``(H, W)`` true where something was hit: by the depth, or without one by the position."""
+        position = images["position"]
+        hit = ~nothing_hit(images["depth"])[..., 0] if "depth" in images else (position != 0).any(-1)
+        known: Mask = np.isfinite(position).all(-1) & hit
+        return known
+
+    def camera(self, number: int, images: Mapping[str, Image]) -> Array | None:
         """The world-to-clip matrix of a frame: the given one, or one fitted to its positions."""
         if self.cameras is not None:
             return convert(self.cameras.view_projection(number, self.size), self.camera_convention)
         if not self.has_camera or "position" not in images:
             return None
-        found = fit_camera(images["position"], hit(images, seen))
+        found = fit_camera(images["position"], self.known(images))
         return None if found is None else found.matrix
 
     def part(self, layer: Layer) -> Part:
@@ -338,26 +332,40 @@ class RenderedFiles:
         """The data window of a layer in a frame."""
         return read_image_header(self.file(layer, number)).parts[layer.part].window
 
-    def read(self, number: int, layers: Mapping[str, Layer]) -> dict[str, Image]:
-        """Read layers of one frame, opening each file once."""
-        files: defaultdict[Path, dict[int, list[str]]] = defaultdict(lambda: defaultdict(list))
-        for layer in layers.values():
-            channels = files[self.file(layer, number)][layer.part]
-            channels += [channel for channel in layer.channels if channel not in channels]
-        images: dict[str, Image] = {}
-        for path, wanted in files.items():
-            found = read_channels(path, wanted)
-            for name, layer in layers.items():
-                if self.file(layer, number) == path:
-                    pixels = found[layer.part][..., [wanted[layer.part].index(c) for c in layer.channels]]
-                    if self.window is not None:
-                        # Nothing was hit there.
-                        fill = np.inf if name == "depth" else 0.0
-                        pixels = self.window.of(pixels, self.window_of(layer, number), fill)
-                    images[name] = self._decoded(name, layer, pixels, path)
-        if self.positions_of_camera and "position" in images:
-            images["position"] = self.in_world(number, images["position"])
-        return images
+    def has(self, layer: Layer, number: int) -> bool:
+        """Whether a frame has the file of a layer."""
+        return number in self.groups[layer.group].files
+
+    def read(self, number: int, layers: Iterable[Layer]) -> dict[Layer, Image]:
+        """Read layers of one frame, opening each file once: linear light, in the window of all frames."""
+        files: defaultdict[Path, list[Layer]] = defaultdict(list)
+        images: dict[Layer, Image] = {}
+        for layer in layers:
+            path = self.file(layer, number)
+            if (path, layer) in self.kept:
+                images[layer] = self.kept[path, layer]
+            else:
+                files[path].append(layer)
+        for path, own in files.items():
+            images |= read_layers(path, own)
+        return {layer: self._decoded(number, layer, pixels) for layer, pixels in images.items()}
+
+    def read_buffers(self, number: int, names: Iterable[str]) -> dict[str, Image]:
+        """Read the layers of buffers of one frame, with the channels of these."""
+        layers = {name: self.choice.layers[name] for name in names}
+        pixels = self.read(number, layers.values())
+        return {name: self.as_buffer(number, name, pixels[layer]) for name, layer in layers.items()}
+
+    def as_buffer(self, number: int, name: str, pixels: Image) -> Image:
+        """The channels of a buffer; color and motion keep those that they have."""
+        if name in GREY and pixels.shape[2] == 1:
+            return np.repeat(pixels, 3, -1)
+        if name in ("color", "motion"):
+            return pixels
+        if name == "variance" and pixels.shape[2] < 3:
+            return np.repeat(pixels[..., :1], 3, -1)
+        pixels = pixels[..., : BUFFERS[name].channels]
+        return self.in_world(number, pixels) if name == "position" and self.positions_of_camera else pixels
 
     def in_world(self, number: int, position: Image) -> Image:
         """Convert camera-space positions to world space by the attribute ``worldToCamera``; 0 is no position."""
@@ -371,42 +379,27 @@ class RenderedFiles:
         world = (homogeneous @ np.linalg.inv(to_camera))[..., :3]
         return np.where((position != 0).any(-1, keepdims=True), world, 0).astype(np.float32)
 
-    def _decoded(self, name: str, layer: Layer, pixels: Image, path: Path) -> Image:
+    def _decoded(self, number: int, layer: Layer, pixels: Image) -> Image:
+        others = {own: name for name, own in self.choice.layers.items() if name not in _LIGHT}
+        if self.window is not None:
+            # Nothing was hit outside of the data window.
+            fill = np.inf if others.get(layer) == "depth" else 0.0
+            pixels = self.window.of(pixels, self.window_of(layer, number), fill)
         if pixels.shape[:2] != self.size:
             (height, width), (found_height, found_width) = self.size, pixels.shape[:2]
             raise InputError(
-                f"{path}: expected {width} x {height} pixels like the first color file, found "
+                f"{self.file(layer, number)}: expected {width} x {height} pixels like the first color file, found "
                 f"{found_width} x {found_height}; render all buffers and frames at one size"
             )
-        # Layers of light are not buffers.
-        if self.part(layer).display_referred and (name in _LIGHT or name not in BUFFERS):
+        if self.part(layer).display_referred and layer not in others:
             pixels = np.concatenate([decode(pixels[..., :3], self.part(layer).gamma), pixels[..., 3:]], -1)
-        channels = BUFFERS[name].channels if name in BUFFERS else 3
-        if name in GREY and pixels.shape[2] == 1:
-            return np.repeat(pixels, 3, -1)
-        if name in ("color", "motion"):
-            return pixels
-        if name == "variance" and pixels.shape[2] < 3:
-            return np.repeat(pixels[..., :1], 3, -1)
-        return pixels[..., :channels]
+        return pixels
 
 
 def _without_lossy_black(radiance: Image) -> Image:
     """Remove small negative values that rounding and lossy compression leave in black pixels."""
     clean: Image = np.where((radiance < 0) & (radiance > -_LOSSY), 0, radiance)
     return clean
-
-
-def seen_of(images: Mapping[str, Image]) -> Mask | None:
-    """``(H, W, 1)`` true where the depth shows a hit; ``None`` without a depth."""
-    return ~nothing_hit(images["depth"]) if "depth" in images else None
-
-
-def hit(images: Mapping[str, Image], seen: Mask | None) -> Mask:
-    """``(H, W)`` true where something was hit: by the depth, or without one by the position."""
-    position = images["position"]
-    known: Mask = np.isfinite(position).all(-1) & ((position != 0).any(-1) if seen is None else seen[..., 0])
-    return known
 
 
 def world_to_camera(metadata: Metadata) -> Array | None:
@@ -429,5 +422,6 @@ def _far_points(matrix: Array, depth: float, sky: Mask) -> Array:
     return result
 
 
-def _tensor(image: Image) -> Tensor:
+def as_tensor(image: Image) -> Tensor:
+    """``(1, C, H, W)`` of ``(H, W, C)``."""
     return torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None].contiguous()

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
-from mcdenoise.data.images import Part
+from mcdenoise.data.exr import Image
+from mcdenoise.data.images import Part, read_channels
 from mcdenoise.frame import BUFFERS
 
 # Renderers' names of each buffer, in lower-case letters and digits, in order of preference; for Blender, Mitsuba, pbrt,
@@ -164,6 +166,22 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
         if not only.name or len(only.channels) == 1 or (says is not None and says[1] <= _ROOT_RANK):
             return [picture]
     return found
+
+
+def read_layers(path: Path, layers: Iterable[Layer], rows: slice = slice(None)) -> dict[Layer, Image]:
+    """Read some rows of layers of one file, opening it once.
+
+    Raises:
+        InputError: see :func:`mcdenoise.data.images.read_channels`.
+    """
+    wanted: dict[int, dict[str, int]] = {}
+    layers = list(layers)
+    for layer in layers:
+        places = wanted.setdefault(layer.part, {})
+        for channel in layer.channels:
+            places.setdefault(channel, len(places))
+    found = read_channels(path, {part: list(places) for part, places in wanted.items()}, rows)
+    return {layer: found[layer.part][..., [wanted[layer.part][c] for c in layer.channels]] for layer in layers}
 
 
 def is_luminance(layer: Layer) -> bool:

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,44 @@ from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
 
 ALL = "all"
+
+
+class Passes(NamedTuple):
+    """A renderer's layers of light, which add up to its color.
+
+    Args:
+        diffuse: names of layers of diffuse light.
+        others: names of layers of all other light.
+        specular_albedo: name of the color of glossy reflection, if there is one.
+    """
+
+    diffuse: tuple[str, ...]
+    others: tuple[str, ...]
+    specular_albedo: str = ""
+
+
+def _passes(diffuse: str, others: str, specular_albedo: str = "") -> Passes:
+    return Passes(tuple(diffuse.split(", ")), tuple(others.split(", ")), specular_albedo)
+
+
+# Blender to 4.5, Blender from 5.0 on, Arnold, RenderMan, LuxCore.
+PASSES = (
+    _passes("DiffDir, DiffInd", "GlossDir, GlossInd, TransDir, TransInd, VolumeDir, VolumeInd, Emit, Env", "GlossCol"),
+    _passes(
+        "Diffuse Direct, Diffuse Indirect",
+        "Glossy Direct, Glossy Indirect, Transmission Direct, Transmission Indirect, "
+        "Volume Direct, Volume Indirect, Emission, Environment",
+        "Glossy Color",
+    ),
+    _passes(
+        "diffuse_direct, diffuse_indirect, sss_direct, sss_indirect",
+        "specular_direct, specular_indirect, coat_direct, coat_indirect, sheen_direct, sheen_indirect, "
+        "transmission_direct, transmission_indirect, volume_direct, volume_indirect, emission, background",
+        "specular_albedo",
+    ),
+    _passes("directDiffuse, indirectDiffuse, subsurface", "directSpecular, indirectSpecular, transmissive, emissive"),
+    _passes("DIRECT_DIFFUSE, INDIRECT_DIFFUSE", "DIRECT_GLOSSY, INDIRECT_GLOSSY, INDIRECT_SPECULAR, EMISSION"),
+)
 # Blender divides light by the surface color: `DiffDir` times `DiffCol` is the additive part.
 _DIVIDED = {
     f"{kind}{way}": f"{kind}{color}"
@@ -25,25 +64,9 @@ _DIVIDED = {
     for kind in kinds
     for way in ways
 }
-# Additive layers of Blender, Arnold, RenderMan, V-Ray and LuxCore, which ``all`` tries first.
-_ADDED = {
-    *_DIVIDED,
-    *("Emit", "Env", "VolumeDir", "VolumeInd", "Emission", "Environment", "Volume Direct", "Volume Indirect"),
-    *("diffuse_direct", "diffuse_indirect", "specular_direct", "specular_indirect", "coat_direct", "coat_indirect"),
-    *("sheen_direct", "sheen_indirect", "transmission_direct", "transmission_indirect", "sss_direct", "sss_indirect"),
-    *("volume_direct", "volume_indirect", "emission", "background"),
-    *(
-        "directDiffuse",
-        "indirectDiffuse",
-        "directSpecular",
-        "indirectSpecular",
-        "subsurface",
-        "transmissive",
-        "emissive",
-    ),
-    *("DIRECT_DIFFUSE", "DIRECT_GLOSSY", "EMISSION", "INDIRECT_DIFFUSE", "INDIRECT_GLOSSY", "INDIRECT_SPECULAR"),
-}
-
+# All layers of light with known names, which ``all`` tries first.
+KNOWN = {title for passes in PASSES for title in (*passes.diffuse, *passes.others)}
+_ADDED = KNOWN | _DIVIDED.keys()
 _MATTES = ("Crypto", "crypto", "Debug", "Index", "Material Index", "Object Index")
 # Smallest color by which light is divided.
 _DARKEST = 1e-3
@@ -53,6 +76,11 @@ _MISSING = 0.9
 WHOLE, _COPY = 0.01, 0.1
 # Number of sets of layers to try.
 _MOST_SETS = 4096
+# Half floats round light, the color that it was divided by, and the sum, by 2^-11 each: allow for four roundings. Near
+# 0 the spacing is 2^-24.
+_ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
+# Largest fraction of pixels that are not equal, such as those brighter than the largest half float.
+_MOST_OFF = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,10 +93,15 @@ class Light:
 
     layers: tuple[Layer, ...]
 
-    def radiance(self, images: Sequence[Image]) -> Image:
+    def radiance(self, images: Mapping[Layer, Image]) -> Image:
         """Compute the additive radiance from the pixels of its layers; invalid values are handled later."""
-        result: Image = images[0] if len(images) == 1 else images[0] * images[1]
-        return result
+        own, *colors = (images[layer][..., :3] for layer in self.layers)
+        return own * colors[0] if colors else own
+
+    @property
+    def color(self) -> Layer | None:
+        """The color by which the layer is divided."""
+        return self.layers[1] if len(self.layers) > 1 else None
 
 
 def keeps(color: Image | None) -> Mask | bool:
@@ -98,6 +131,25 @@ def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool
     left = sum(held.values())
     scale = np.divide(total, left, out=np.ones_like(total), where=left > 0)
     return {name: (radiance * scale).astype(np.float32) for name, radiance in held.items()}
+
+
+def difference(one: Image | Array, other: Image | Array, count: int) -> float:
+    """The fraction of the pixels ``(H, W, 3)`` that differ by more than the rounding of half floats.
+
+    Args:
+        one: sum or mean of images that were rounded.
+        other: what it may be equal to.
+        count: number of images that were rounded.
+    """
+    known = (np.isfinite(one) & np.isfinite(other)).all(-1)
+    one, other = one[known], other[known]
+    far = np.abs(one - other) > _ROUNDING * np.maximum(np.abs(one), np.abs(other)) + count * _SMALLEST_HALF
+    return float(far.any(-1).mean()) if known.any() else 1.0
+
+
+def is_same(difference: float) -> bool:
+    """Whether two images are equal, from their :func:`difference`."""
+    return difference <= _MOST_OFF
 
 
 def left_of(color: Image, parts: Sequence[Image]) -> float:
@@ -209,8 +261,8 @@ def find_lights(
 
     def radiance(chosen: Sequence[Layer]) -> dict[str, Image]:
         """The pixels of lights, as far as they have been read."""
-        parts = [(layer, *color_of(layer, own)) for layer in chosen]
-        return {each[0].name: Light(each).radiance([pixels[p] for p in each]) for each in parts if {*each} <= {*pixels}}
+        parts = [Light((layer, *color_of(layer, own))) for layer in chosen]
+        return {each.layers[0].name: each.radiance(pixels) for each in parts if {*each.layers} <= {*pixels}}
 
     expanded: list[str] = []
     for name in names:

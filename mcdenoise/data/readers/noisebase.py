@@ -214,6 +214,11 @@ class NoisebaseFiles(Source):
         """Frames in use that have a reference: all or none."""
         return self.numbers if "reference" in self.shapes else []
 
+    @property
+    def unused(self) -> list[str]:
+        """Arrays that are not used."""
+        return sorted(self.shapes.keys() - _IMAGES.keys() - _NUMBERS.keys() - _REDUNDANT)
+
     def frame_files(self, number: int) -> list[Path]:
         """The zip of one frame, or of all frames."""
         return [self.files[number]]
@@ -258,7 +263,7 @@ class NoisebaseFiles(Source):
             found["samples"] = torch.from_numpy(samples)[None]
         return Frame(color=_tensor(color), **found)
 
-    def write(self, out: Path, number: int, image: Image, *, full_float: bool = False) -> Path:
+    def write(self, out: Path, number: int, image: Image, *, full_float: bool = False, **_: Any) -> Path:
         """Write an EXR with R, G, B, named after the zip, because the arrays hold samples rather than images.
 
         If one zip holds all frames, the frame number is appended to the name. There is neither alpha nor a layer. See
@@ -317,7 +322,6 @@ def open_noisebase(
                 f"{path}: expected array '{name}' of shape {first.get(name)} as in the first frame, found "
                 f"{found.get(name)}; choose frames of one sequence"
             )
-    shot.unused = sorted(first.keys() - _IMAGES.keys() - _NUMBERS.keys() - _REDUNDANT)
     _find_view(shot)
     return shot
 

@@ -16,13 +16,11 @@ import numpy as np
 
 from mcdenoise.data.exr import LARGEST_HALF, Image, write_exr
 from mcdenoise.data.readers.layers import Layer
+from mcdenoise.data.readers.lights import difference, is_same
 
 # Channels after the radiance, in this order, if every sample has them.
 FEATURES = {"albedo": "RGB", "normal": "XYZ", "depth": "Z"}
 _NAME = re.compile(r"(?:.*[._ ])?sample[ _]?([0-9]{1,4})(?:\.(albedo|normal|depth))?", re.IGNORECASE)
-# Rounding of the mean of half floats, and of the color, 2^-11 each; doubled.
-_ROUNDING, _SMALLEST_HALF = 4 * 2.0**-11, 2.0**-24
-_MOST_OFF = 1e-3  # largest fraction of deviating pixels, such as those brighter than a half float
 
 
 @dataclass(frozen=True)
@@ -38,24 +36,15 @@ class SampleLayers:
     features: Mapping[str, tuple[Layer, ...]]
 
     @property
-    def layers(self) -> dict[str, Layer]:
-        """All layers, by a key for :meth:`samples`."""
-        rows = {"radiance": self.radiance, **self.features}
-        return {f"sample {i} {name}": layer for name, own in rows.items() for i, layer in enumerate(own)}
+    def layers(self) -> set[Layer]:
+        """Every layer to read."""
+        return {*self.radiance, *(layer for own in self.features.values() for layer in own)}
 
-    def samples(self, images: Mapping[str, Image]) -> Image:
+    def samples(self, images: Mapping[Layer, Image]) -> Image:
         """``(S, C, H, W)`` from the images of :attr:`layers`: radiance, followed by features."""
-        found = [
-            np.concatenate(
-                [
-                    images[f"sample {i} {name}"][..., : 1 if name == "depth" else 3]
-                    for name in ("radiance", *self.features)
-                ],
-                -1,
-            )
-            for i in range(len(self.radiance))
-        ]
-        return np.ascontiguousarray(np.stack(found).transpose(0, 3, 1, 2), dtype=np.float32)
+        rows = [(3, self.radiance), *((1 if name == "depth" else 3, own) for name, own in self.features.items())]
+        found = [np.stack([images[layer][..., :count] for layer in own]) for count, own in rows]
+        return np.ascontiguousarray(np.concatenate(found, -1).transpose(0, 3, 1, 2), dtype=np.float32)
 
     def __str__(self) -> str:
         features = f" with {', '.join(self.features)}" if self.features else ""
@@ -85,10 +74,7 @@ def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers | None, list[La
 
 def mean_is(color: Image, samples: Image) -> bool:
     """Whether the mean of samples ``(S, C, H, W)`` is the color ``(H, W, 3)``, up to the rounding of half floats."""
-    mean = samples[:, :3].mean(0, dtype=np.float64).transpose(1, 2, 0)
-    known = (np.isfinite(mean) & np.isfinite(color)).all(-1)
-    far = np.abs(mean - color) > _ROUNDING * np.maximum(np.abs(mean), np.abs(color)) + 2 * _SMALLEST_HALF
-    return bool(known.any() and far.any(-1)[known].mean() <= _MOST_OFF)
+    return is_same(difference(samples[:, :3].mean(0, dtype=np.float64).transpose(1, 2, 0), color, 2))
 
 
 def write_samples(path: Path, samples: Image) -> None:

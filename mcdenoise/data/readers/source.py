@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from torch import Tensor
 
-from mcdenoise.data.exr import Metadata
+from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import Window
+from mcdenoise.data.readers.lights import Light
 from mcdenoise.data.readers.values import Row
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 
 
@@ -22,16 +24,18 @@ class Source(ABC):
     Args:
         numbers: frames in use, ascending.
         color_has_albedo: whether the radiance in the files includes the albedo.
+        lights: layers of radiance that are denoised with the color, by name.
+        window: the smallest window with the data windows of all colors, if there is one that differs from another.
         table: the source of each buffer.
         warnings: probable mistakes.
-        unused: what looks like a buffer but is not used.
     """
 
     numbers: list[int]
     color_has_albedo: bool = True
+    lights: Mapping[str, Light] = field(default_factory=dict)
+    window: Window | None = None
     table: list[Row] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    unused: list[str] = field(default_factory=list)
 
     @property
     @abstractmethod
@@ -64,19 +68,14 @@ class Source(ABC):
         return frozenset({"color"})
 
     @property
-    def window(self) -> Window | None:
-        """The window of all frames, if the files have data windows that differ."""
-        return None
+    def unused(self) -> list[str]:
+        """What looks like a buffer but is not used."""
+        return []
 
     @property
     def unknown(self) -> list[str]:
         """Layers with unknown names."""
         return []
-
-    @property
-    def lights(self) -> Collection[str]:
-        """Names of the layers of light."""
-        return ()
 
     @abstractmethod
     def frame_files(self, number: int) -> list[Path]:
@@ -95,3 +94,29 @@ class Source(ABC):
         self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
         """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+
+    def check_output_layer(self, name: str) -> None:
+        """Check that a layer of this name can be added to the files.
+
+        Raises:
+            InputError: the name is invalid, or the files have such a layer already or have no layers.
+        """
+        (path, *_) = self.frame_files(self.numbers[0])
+        raise InputError(
+            f"{path}: expected files with layers to add '{name}' to, found a file a buffer; omit --output-layer: each "
+            "result is a file of its own"
+        )
+
+    @abstractmethod
+    def write(
+        self,
+        out: Path,
+        number: int,
+        image: Image,
+        *,
+        alpha: Image | None = None,
+        lights: Mapping[str, Image] | None = None,
+        output_layer: str | None = None,
+        full_float: bool = False,
+    ) -> Path:
+        """Write the files of a frame with the denoised image; see :meth:`mcdenoise.data.Sequence.write`."""

@@ -27,7 +27,7 @@ from mcdenoise.data.files import write_json
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
-from mcdenoise.data.readers.layers import layers_of
+from mcdenoise.data.readers.layers import layers_of, read_layers
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
@@ -355,8 +355,7 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
     layers = {layer.title: layer for layer in listed}
     found: dict[str, Image] = {}
     for split in find_splits(listed, layers["Combined"], {})[:1] if with_parts else []:
-        images = {key: read_channels(path, {each.part: each.channels})[each.part] for key, each in split.layers.items()}
-        found |= split.sums(images)
+        found |= split.sums(read_layers(path, split.layers))
     for name, names in _PASSES.items():
         layer = next((layers[each] for each in names if each in layers), None)
         if layer is None and len(layers) == 1:

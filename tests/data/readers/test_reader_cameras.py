@@ -253,7 +253,7 @@ def test_matrices_of_something_else_are_told(small_sequence: Path) -> None:
     write_camera_matrices(path, replace(cameras, matrices=moved), "plane")
     (warning,) = open_sequence(small_sequence).warnings
     assert "camera_matrices.h" in warning
-    assert "whichever way they are read" in warning
+    assert "whichever way" in warning
 
 
 @pytest.mark.parametrize(
