@@ -13,23 +13,25 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 
-from mcdenoise.data.exr import (
-    LARGEST_PIXEL_COUNT,
-    Image,
-    Metadata,
-    check_name,
-    is_hollow,
-    pending_error,
-    picture_metadata,
-    what_is_at,
-)
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, is_unicode
 
+Image: TypeAlias = NDArray[np.float32]
+Mask: TypeAlias = NDArray[np.bool_]
+MetadataValue: TypeAlias = str | int | float | tuple[float, ...]
+Metadata: TypeAlias = dict[str, MetadataValue]
+
+LARGEST_PIXEL_COUNT = 2**28
+# Largest number of black pixels per byte of a file: zlib's limit is 1032, and PXR24 first drops a quarter; DWA stores
+# one number for 64, or two bytes for a run of 128.
+_LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
+# These attributes describe how one file stores its pixels, not the picture; the written file has its own.
+STORAGE_PREFIXES = ("oiio:", "openexr:", "compression", "textureformat")
 # Supported formats by OpenImageIO's names.
 FORMATS = {
     ".exr": "openexr",
@@ -176,8 +178,8 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
         file.close()
 
 
-def read_picture(path: Path) -> tuple[oiio.ImageSpec, Part, Image]:
-    """Read all channels of the first image of a file; also return OpenImageIO's and our own description of it.
+def read_picture(path: Path) -> tuple[oiio.ImageSpec, ImageHeader, Image]:
+    """Read all channels of the first image of a file; also return OpenImageIO's and our own description of the file.
 
     This does not use ``oiio.ImageBuf``, which reads a PFM upside down.
 
@@ -187,8 +189,7 @@ def read_picture(path: Path) -> tuple[oiio.ImageSpec, Part, Image]:
     file, header = _open(path)
     try:
         file.seek_subimage(0, 0)
-        part = header.parts[0]
-        return file.spec(), part, _read(path, file, 0, part, part.channels)
+        return file.spec(), header, _read(path, file, 0, header.parts[0], header.parts[0].channels)
     finally:
         file.close()
 
@@ -202,9 +203,12 @@ def _read(
     height, width = part.size
     try:
         spec = file.spec(index)
-        if spec.tile_width or path.suffix.lower() not in EXR_SUFFIXES:
+        # All rows at once are decoded by several threads.
+        whole = rows == slice(None) and len(picked) == len(part.channels)
+        if whole or spec.tile_width or path.suffix.lower() not in EXR_SUFFIXES:
             pixels = file.read_image(index, 0, first, end, oiio.FLOAT)
-            found = None if pixels is None else np.asarray(pixels).reshape(height, width, -1)[rows][..., picked]
+            found = None if pixels is None else np.asarray(pixels).reshape(height, width, -1)[rows]
+            found = found if found is None or picked == [*range(found.shape[2])] else found[..., picked]
         else:
             first_row, end_row, _ = rows.indices(height)
             found = np.empty((end_row - first_row, width, len(names)), np.float32)
@@ -231,7 +235,7 @@ def _read(
 def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
     # Not Path.is_file, which raises an error for a name that is too long or a folder without access.
     if not os.path.isfile(path):
-        raise InputError(f"{path}: expected an image, found {what_is_at(path)}; check the path")
+        raise InputError(f"{path}: expected an image, found {_what_is_at(path)}; check the path")
     check_name(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
@@ -293,6 +297,64 @@ def _png_is_whole(path: Path) -> bool:
     return False
 
 
+def _what_is_at(path: Path) -> str:
+    """Describe what is at a path instead of a file, for messages."""
+    if os.path.isdir(path):
+        return "a folder"
+    if os.path.exists(path):
+        return "a device or a pipe"
+    return "a link to nothing" if os.path.lexists(path) else "no such file"
+
+
+def check_name(path: Path) -> None:
+    """Reject a name that cannot be passed to OpenImageIO.
+
+    Raises:
+        InputError: the name is not valid UTF-8.
+    """
+    if not is_unicode(str(path)):
+        raise InputError(f"{path}: expected a name in UTF-8, found other bytes; rename the file")
+
+
+def _is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:
+    """Whether a header declares more pixels than its file can hold, whatever the compression."""
+    dwa = str(spec.getattribute("compression")).startswith("dwa")
+    ratio = _LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO
+    return promised > ratio * os.path.getsize(path)
+
+
+def _picture_metadata(spec: oiio.ImageSpec) -> Metadata:
+    """The attributes that describe the picture rather than its storage."""
+    kept: Metadata = {}
+    for attribute in spec.extra_attribs:
+        value = attribute.value
+        if isinstance(value, str) and not value.isascii():
+            value = _as_text(value)
+        if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
+            continue
+        if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(STORAGE_PREFIXES):
+            kept[_as_text(attribute.name)] = value
+    return kept
+
+
+def _as_text(text: str) -> str:
+    """Decode bytes that are not UTF-8, and arrive as surrogates, as Latin-1, which old systems write."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return text.encode(errors="surrogateescape").decode("latin-1")
+    return text
+
+
+def pending_error(source: Any) -> str:
+    """OpenImageIO's pending error in one line; a damaged header can make it contain invalid text."""
+    try:
+        lines = source.geterror().split("\n")
+    except UnicodeDecodeError:
+        return "damaged header"
+    return str(lines[-1]).strip()
+
+
 def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
     parts: list[Part] = []
     metadata: Metadata = {}
@@ -304,7 +366,7 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             spec = file.spec()
             kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
             channels = tuple(spec.channelnames)
-            metadata = metadata or picture_metadata(spec)
+            metadata = metadata or _picture_metadata(spec)
             part_name = _text(spec, "oiio:subimagename") or _text(spec, "name")
             gamma = _gamma_of(spec) if name in ("png", "tiff") else None
         except UnicodeDecodeError as error:
@@ -320,7 +382,7 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             raise _refused(path, f"{spec.width} x {spec.height} pixels")
         bytes_promised += pixels * int(spec.pixel_bytes(True))
         # Checked before memory is allocated.
-        if is_hollow(path, spec, bytes_promised):
+        if _is_hollow(path, spec, bytes_promised):
             raise _refused(
                 path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
             )

@@ -15,7 +15,7 @@ import numpy as np
 import OpenEXR  # noqa: F401
 
 from mcdenoise.data.camera_matrices import read_camera_matrices
-from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.data.exr import read_exr
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
@@ -34,7 +34,7 @@ def read_alone(path: Path) -> None:
     if path.suffix == ".h":
         read_camera_matrices(path)
     else:
-        read_exr_header(path)
+        read_image_header(path)
         read_exr(path)
 
 

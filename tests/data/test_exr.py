@@ -10,8 +10,9 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from mcdenoise.data.exr import read_exr, read_exr_header, write_exr
+from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.images import read_image_header
 from mcdenoise.errors import InputError
 
 RGB = ["R", "G", "B"]
@@ -80,7 +81,7 @@ def test_metadata_is_kept(tmp_path: Path, image: np.ndarray) -> None:
     for name in metadata.keys() - {"compression"}:
         assert found[name] == pytest.approx(metadata[name]), name
     write_exr(tmp_path / "b.exr", image, RGB, metadata=found)
-    assert read_exr_header(tmp_path / "b.exr").metadata == found
+    assert read_image_header(tmp_path / "b.exr").metadata == found
 
 
 @pytest.mark.parametrize("tiled", [False, True])
@@ -159,7 +160,7 @@ def test_another_format_named_exr_is_refused(tmp_path: Path, image: np.ndarray) 
     assert file.write_image(image)
     assert file.close()
     (tmp_path / "a.png").rename(tmp_path / "a.exr")
-    with pytest.raises(InputError, match="found a png file") as error:
+    with pytest.raises(InputError, match="of the format png") as error:
         read_exr(tmp_path / "a.exr")
     one_line(error)
 

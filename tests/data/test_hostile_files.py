@@ -20,7 +20,7 @@ from damage import assert_clear, outcomes_of
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import MATRICES
-from mcdenoise.data.exr import read_exr, read_exr_header, write_exr
+from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.errors import InputError, printable
 
 SIZE = 11, 13
@@ -183,7 +183,6 @@ def test_bmfr_refuses_files_without_color(bmfr: Path, channels: dict[str, np.nda
 
 def test_bmfr_refuses_a_buffer_of_other_pixels(bmfr: Path) -> None:
     write(bmfr / "albedo0.exr", part("RGB", dataWindow=window(3, -2)))
-    assert read_exr_header(bmfr / "albedo0.exr").origin == (3, -2)
     with pytest.raises(InputError, match=r"albedo0\.exr: .*pixels at -2, 3"):
         open_sequence(bmfr)
     # All of them there is a crop, and well.

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, find_camera_matrices
-from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, read_exr_header, write_exr
+from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, write_exr
 from mcdenoise.data.files import write_text
-from mcdenoise.data.images import Part, read_image_header
+from mcdenoise.data.images import Part, read_image_header, read_picture
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, SPECULAR, find_splits
 from mcdenoise.data.readers.examining import examine, examine_parts
@@ -178,7 +178,7 @@ def find_bmfr(given: Sequence[Path]) -> tuple[Path, Files] | None:
 
 def _is_bmfr(path: Path, files: Files) -> bool:
     with suppress(InputError):
-        if len(read_exr_header(next(iter(files["color"].values()))).channels) != BUFFERS["color"].channels:
+        if len(read_image_header(next(iter(files["color"].values()))).parts[0].channels) != BUFFERS["color"].channels:
             return False
     if {_DESCRIPTION, MATRICES} & set(os.listdir(path)):
         return True
@@ -385,11 +385,10 @@ def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> b
 @functools.cache
 def _is_whole(path: Path, size: tuple[int, int], channels: int, *_: int) -> bool:
     try:
-        header = read_exr_header(path)
-        whole = header.size == size[::-1] and header.origin == (0, 0) and len(header.channels) == channels
-        return whole and bool(read_exr(path)[0].size)
+        part = read_picture(path)[1].parts[0]
     except InputError:
         return False
+    return part.size == size[::-1] and part.origin == (0, 0) and len(part.channels) == channels
 
 
 CLEAN = "clean"

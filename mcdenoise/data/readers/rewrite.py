@@ -154,9 +154,9 @@ def _stored(image: Image, kind: Any) -> Any:
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> str:
     """Write a file with one picture, with its other channels and its pixel type unchanged."""
-    spec, part, pixels = read_picture(source)
-    stored = stored or part
-    for place, name in enumerate(part.channels):
+    spec, header, pixels = read_picture(source)
+    stored = stored or header.parts[0]
+    for place, name in enumerate(header.parts[0].channels):
         if name in replaced:
             image = replaced[name]
             display = stored.display_referred and name.lower() not in ("a", "alpha")

@@ -12,8 +12,9 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
-from mcdenoise.data.exr import read_exr, read_exr_header
+from mcdenoise.data.exr import read_exr
 from mcdenoise.data.files import write_json
+from mcdenoise.data.images import read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
@@ -170,7 +171,7 @@ class SequenceFolder:
             # A damaged reference is rendered again, like any other damaged file.
             if not has_buffer(self.path, number, "reference", (self._settings["width"], self._settings["height"])):
                 continue
-            header = read_exr_header(path).metadata
+            header = read_image_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
             if spp is None and number in known_spp:
                 # Older versions wrote no number of passes: there cannot be more passes than paths.
