@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from kornia.augmentation import RandomHorizontalFlip, RandomRotation90, RandomVerticalFlip
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
@@ -119,11 +118,10 @@ class ClipSampler:
     The position, the frames, the noise seed, flips, 90-degree rotations and the options below are random. Each clip
     depends only on its own seed: a batch can be drawn in any order, at any time, by any number of processes.
 
-    Flips and rotations are kornia's, the same for all buffers and frames of a clip. Motion vectors are transformed with
-    the image, and the camera's matrix projects to the transformed crop. World-space normals and positions are not
-    transformed: a flipped or rotated image shows a flipped or rotated world with other names of axes. For the same
-    reason, axes are also permuted and reversed at random. Color channels are permuted in the same way in radiance and
-    albedo.
+    Flips and rotations are the same for all buffers and frames of a clip. Motion vectors are transformed with the image,
+    and the camera's matrix projects to the transformed crop. World-space normals and positions are not transformed: a
+    flipped or rotated image shows a flipped or rotated world with other names of axes. For the same reason, axes are
+    also permuted and reversed at random. Color channels are permuted in the same way in radiance and albedo.
 
     Light is linear: scaling all lamps of a scene, also per channel, scales noisy color and reference by the same
     factor. Networks normalize the exposure, so this changes only the loss, whose epsilon is in units of radiance.
@@ -172,17 +170,11 @@ class ClipSampler:
         self.less_noise = less_noise
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
-        self.flips_and_turns = nn.Sequential(
-            RandomHorizontalFlip(p=0.5),
-            RandomVerticalFlip(p=0.5),
-            # "nearest" keeps integer values; "bilinear" would mix them.
-            RandomRotation90((0, 3), p=1.0, resample="nearest"),
-        )
 
     def draw(self, seeds: Sequence[int]) -> Clip:
         """Draw a clip for each seed; the probability of a shot is proportional to its number of frames."""
         drawn = []
-        # kornia uses torch's global generator, which must not change for other users.
+        # Torch's global generator must not change for other users.
         with torch.random.fork_rng(devices=[]):
             for seed in seeds:
                 torch.default_generator.manual_seed(seed)
@@ -196,7 +188,7 @@ class ClipSampler:
         noise_seed, start = _randint(shot.noise_seeds), first + _randint(len(shot) - self.frames + 1 - first)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
-        turn = self._draw_turn()
+        turn = _Turn(_randint(4), bool(_randint(2)))
         clip = shot.read(
             slice(start, start + self.frames),
             slice(top, top + self.crop),
@@ -234,17 +226,6 @@ class ClipSampler:
             for _ in range(1 + _randint(3)):
                 self._hang_lamp(clip, mean, demodulated=shot.demodulated)
         return clip
-
-    def _draw_turn(self) -> _Turn:
-        """Let kornia transform a 2x2 image, and read off the same transformation as a view for arrays of any size."""
-        corners = torch.arange(4.0).reshape(1, 1, 2, 2)
-        moved = self.flips_and_turns(corners)[0, 0].numpy()
-        for turns in range(4):
-            for flip in (False, True):
-                turn = _Turn(turns, flip)
-                if np.array_equal(turn.image(corners[0, 0].numpy()), moved):
-                    return turn
-        raise RuntimeError(f"kornia: expected flips and 90-degree turns, found {moved.tolist()}")
 
     def _hang_lamp(self, clip: dict[str, Tensor], mean: Tensor, *, demodulated: bool) -> None:
         """Paint a rectangle of constant radiance in all frames, with or without albedo."""
