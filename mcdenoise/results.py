@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import reprlib
-import types
-from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
@@ -20,12 +21,16 @@ from mcdenoise.reading import read_text
 FILE = "results.json"
 OPS_FILE = "ops.json"
 IMAGES = "images"
-VERSION = 2
+VERSION: Literal[2] = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
 # Suffix of a method's name if it skips nothing, for comparing it with the same method that does.
 KEEP_ALL = ", keep all"
 # Larger than any measured value; its square is still finite, and it can be plotted.
-_LARGEST = 1e100
+Number = Annotated[float, Meta(ge=-1e100, le=1e100)]
+Amount = Annotated[float, Meta(ge=0, le=1e100)]
+# Whole numbers up to those that a float represents.
+Count = Annotated[int, Meta(ge=0, lt=2**53)]
+Positive = Annotated[int, Meta(ge=1, lt=2**53)]
 Kind = Literal["trainable", "fixed", "baseline"]
 
 
@@ -40,10 +45,10 @@ class Spread:
         count: number of measurements.
     """
 
-    median: float
-    lower: float
-    upper: float
-    count: int
+    median: Number
+    lower: Number
+    upper: Number
+    count: Count
 
     @classmethod
     def of(cls, values: list[float]) -> Spread:
@@ -72,10 +77,10 @@ class Machine:
     """
 
     processor: str
-    cores: int
-    memory: float
+    cores: Count
+    memory: Amount
     device: str
-    threads: int
+    threads: Count
     system: str
     packages: dict[str, str] = field(default_factory=dict)
 
@@ -96,12 +101,12 @@ class Scene:
     """
 
     name: str
-    width: int
-    height: int
-    frames: list[int]
-    scored: list[int]
-    pictures: list[int] = field(default_factory=list)
-    reference_noise: float | None = None
+    width: Positive
+    height: Positive
+    frames: list[Count]
+    scored: list[Count]
+    pictures: list[Count] = field(default_factory=list)
+    reference_noise: Amount | None = None
 
 
 @dataclass(frozen=True)
@@ -129,7 +134,7 @@ class Method:
     weights: str = ""
     precision: Precision = "float32"
     keep_all: bool = False
-    parameters: int | None = None
+    parameters: Count | None = None
     missing: str = ""
 
 
@@ -156,15 +161,15 @@ class Cell:
 
     scene: str
     method: str
-    errors: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, Number] = field(default_factory=dict)
     errors_spread: dict[str, Spread] = field(default_factory=dict)
     whole: Spread | None = None
     stages: dict[str, Spread] = field(default_factory=dict)
-    memory: float | None = None
+    memory: Amount | None = None
     failure: str = ""
     computing: Spread | None = None
     plan: list[dict[str, Any]] = field(default_factory=list)
-    on_the_way: dict[str, dict[str, float]] = field(default_factory=dict)
+    on_the_way: dict[str, dict[str, Number]] = field(default_factory=dict)
     lacking: bool = False
 
     @property
@@ -206,8 +211,8 @@ class Cost:
     """
 
     method: str
-    width: int
-    height: int
+    width: Positive
+    height: Positive
     milliseconds: Spread | None = None
     failure: str = ""
 
@@ -226,9 +231,9 @@ class Fit:
     """
 
     method: str
-    fixed: float
-    per_megapixel: float
-    deviation: float
+    fixed: Number
+    per_megapixel: Number
+    deviation: Amount
 
 
 @dataclass(frozen=True)
@@ -252,13 +257,13 @@ class Results:
     command: str
     created: str
     machine: Machine
-    rounds: int
+    rounds: Count
     scenes: list[Scene]
     methods: list[Method]
     cells: list[Cell]
     costs: list[Cost] = field(default_factory=list)
     fits: list[Fit] = field(default_factory=list)
-    version: int = VERSION
+    version: Literal[2] = VERSION
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -312,21 +317,17 @@ class Results:
         path = folder / FILE
         expected = f"{path}: expected the results of `mcdenoise benchmark`, found"
         try:
-            data = json.loads(read_text(path), parse_constant=_refuse)
-            if isinstance(data, dict) and data.get("version") != VERSION:
-                raise InputError(f"{path}: expected version {VERSION} of the format, found {data.get('version')!r}")
-            results: Results = _made(cls, data, "it")
-            _check(results)
+            results = msgspec.json.decode(read_text(path), type=cls)
+            if fault := next(_faults(results), ""):
+                raise ValueError(fault)
         except FileNotFoundError as error:
             raise InputError(f"{expected} no such file") from error
         except OSError as error:
             raise InputError(f"{expected} none that can be read ({error.strerror})") from error
-        except InputError:
-            raise
         except RecursionError as error:
             raise InputError(f"{expected} damage: objects within objects without end") from error
         except ValueError as error:
-            raise InputError(f"{expected} damage: {error}") from error
+            raise InputError(f"{expected} damage or another version of the format: {error}") from error
         return results
 
 
@@ -417,98 +418,29 @@ def _write(path: Path, results: Results | OpResults) -> None:
     write_text(path, json.dumps(asdict(results), indent=1, allow_nan=False) + "\n")
 
 
-def _refuse(name: str) -> float:
-    raise ValueError(f"{name}, which is no number")
-
-
-def _made(kind: Any, value: Any, where: str) -> Any:
-    """Convert a JSON value to the annotated type of a field, recursively.
-
-    Raises:
-        ValueError: the value has another type.
-    """
-    if isinstance(kind, types.UnionType):
-        return None if value is None else _made(get_args(kind)[0], value, where)
-    if is_dataclass(kind):
-        return _made_of_fields(kind, value, where)
-    holder, inner = get_origin(kind), get_args(kind)
-    if holder is list and isinstance(value, list):
-        return [_made(inner[0], one, f"{where}[{index}]") for index, one in enumerate(value)]
-    if holder is dict and isinstance(value, dict):
-        return {key: _made(inner[1], one, f"{where}.{key}") for key, one in value.items()}
-    if holder is Literal and isinstance(value, str) and value in inner:
-        return value
-    # JSON writes some floats as integers. Python counts true and false as integers; here they are not.
-    if kind is float and type(value) in (int, float) and abs(value) <= _LARGEST:
-        return float(value)
-    # Larger values would overflow in computations.
-    if kind is int and type(value) is int and abs(value) < 2**53:
-        return value
-    if kind is Any or (kind in (str, bool) and type(value) is kind):
-        return value
-    known = f"one of {', '.join(inner)}" if holder is Literal else getattr(kind, "__name__", str(kind))
-    raise ValueError(f"{where} is {reprlib.repr(value)} in place of {known}")
-
-
-# Cached, because this takes longer than everything else and there are hundreds of cells.
-_hints = functools.cache(get_type_hints)
-
-
-def _made_of_fields(kind: Any, value: Any, where: str) -> Any:
-    if not isinstance(value, dict):
-        raise ValueError(f"{where} is {reprlib.repr(value)} in place of an object")
-    hints = _hints(kind)
-    if unknown := sorted(value.keys() - hints.keys()):
-        raise ValueError(f"{where} has {reprlib.repr(unknown[0])}, which is unknown")
-    needed = {one.name for one in fields(kind) if one.default is MISSING and one.default_factory is MISSING}
-    if lacking := sorted(needed - value.keys()):
-        raise ValueError(f"{where} has no '{lacking[0]}'")
-    return kind(**{key: _made(hints[key], one, f"{where}.{key}") for key, one in value.items()})
-
-
-def _check(results: Results) -> None:
-    """Check that the parts are consistent with one another, and that values are in a plausible range.
-
-    Raises:
-        ValueError: they are not.
-    """
-
-    def check(holds: bool, what: str) -> None:
-        if not holds:
-            raise ValueError(what)
-
+def _faults(results: Results) -> Iterator[str]:
+    """What is inconsistent in results whose types are right."""
     scenes, methods = [one.name for one in results.scenes], [one.name for one in results.methods]
     for kind, names in (("scenes", scenes), ("methods", methods)):
-        check(bool(names), f"there are no {kind}")
-        check(len(set(names)) == len(names), f"two {kind} have one name")
-    for part in (*(scene.name for scene in results.scenes), *(method.folder for method in results.methods)):
-        # Images are read from folders of these names.
+        if len(set(names)) != len(names) or not names:
+            yield f"{kind} without names of their own: {reprlib.repr(names)}"
+    # Images are read from folders of these names.
+    for part in (*scenes, *(method.folder for method in results.methods)):
         plain = part not in ("", ".", "..") and not {"/", "\\", "\0"} & set(part) and part.isprintable()
-        check(plain and len(part.encode(errors="replace")) <= 255, f"{reprlib.repr(part)} is no name of a folder")
-    for scene in results.scenes:
-        check(min(scene.width, scene.height) > 0, f"{scene.name} has {scene.width} x {scene.height} pixels")
-        for numbers in (scene.frames, scene.scored, scene.pictures):
-            check(min(numbers, default=0) >= 0, f"{scene.name} has frame {min(numbers, default=0)}")
+        if not plain or len(part.encode(errors="replace")) > 255:
+            yield f"{reprlib.repr(part)}, which is no name of a folder"
     for cell in results.cells:
-        where = f"{reprlib.repr(cell.method)} on {reprlib.repr(cell.scene)}"
-        check(cell.scene in scenes and cell.method in methods, f"{where} is of no scene or method")
-        check(cell.memory is None or cell.memory >= 0, f"{where} takes {cell.memory} mebibytes")
-        for spread in (cell.whole, cell.computing):
-            _check_time(spread, where)
-        for spread in cell.stages.values():
-            _check_time(spread, where)
+        if cell.scene not in scenes:
+            yield f"measurements of {reprlib.repr(cell.scene)}, which is no scene"
         for row in cell.plan:
             stage, skipped = row.get("stage"), row.get("skipped")
-            true = isinstance(stage, str) and isinstance(skipped, int | float) and 0 <= skipped <= 1
-            check(true, f"{where} has the plan {reprlib.repr(row)}")
-    for cost in results.costs:
-        check(cost.method in methods, f"a cost is of {reprlib.repr(cost.method)}, which is no method")
-        check(min(cost.width, cost.height) > 0, f"a cost is of {cost.width} x {cost.height} pixels")
-        _check_time(cost.milliseconds, reprlib.repr(cost.method))
-    for fit in results.fits:
-        check(fit.method in methods, f"a fit is of {reprlib.repr(fit.method)}, which is no method")
-
-
-def _check_time(spread: Spread | None, where: str) -> None:
-    if spread is not None and not (0 <= spread.lower <= spread.median <= spread.upper and spread.count > 0):
-        raise ValueError(f"{where} takes {spread}")
+            if not (isinstance(stage, str) and isinstance(skipped, int | float) and 0 <= skipped <= 1):
+                yield f"the plan {reprlib.repr(row)}"
+    for name in (one.method for one in (*results.cells, *results.costs, *results.fits)):
+        if name not in methods:
+            yield f"measurements of {reprlib.repr(name)}, which is no method"
+    cells = ((cell.whole, cell.computing, *cell.stages.values()) for cell in results.cells)
+    for times in (*cells, (cost.milliseconds for cost in results.costs)):
+        for time in times:
+            if time is not None and not (0 <= time.lower <= time.median <= time.upper and time.count > 0):
+                yield f"a time of {time}"
