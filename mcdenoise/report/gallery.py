@@ -28,6 +28,7 @@ from mcdenoise.results import IMAGES, Method, Results, Scene
 
 REFERENCE = "reference"
 _THUMBNAIL_WIDTH = 480
+_GRAY = 0.18
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class Gallery:
         close_ups: by method, the same crops for each.
         stripe: ``None`` if fewer than two frames were kept.
         profiles: by method, as data URIs: one row of pixels for each frame.
+        exposure: stops by which the reference is shown brighter, so that its typical pixel is a middle gray.
     """
 
     scene: Scene
@@ -87,6 +89,7 @@ class Gallery:
     close_ups: dict[str, list[CloseUp]]
     stripe: Stripe | None
     profiles: dict[str, str]
+    exposure: float = 0.0
 
 
 def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 1) -> Gallery:
@@ -120,6 +123,7 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
         close_ups,
         stripe,
         {name: picture for name, picture in profiles.items() if picture},
+        _exposure(codes.get(REFERENCE) or next(iter(codes.values()), {})),
     )
 
 
@@ -185,6 +189,13 @@ def _close_ups(
     while scene.width // step > _THUMBNAIL_WIDTH:
         step *= 2
     return close_ups, data_uri(to_srgb(_smaller(reference, step)), "jpeg", quality=88)
+
+
+def _exposure(pictures: dict[int, Codes]) -> float:
+    """Stops, in quarters, from the geometric mean of all lit pixels to a middle gray; 0 where all is black."""
+    lit = [decode(codes[codes > 0]) for codes in pictures.values()]
+    means = [np.log2(values).mean() for values in lit if values.size]
+    return min(max(round(4 * float(np.log2(_GRAY) - np.mean(means))) / 4, -8.0), 8.0) if means else 0.0
 
 
 def _stripe(codes: dict[str, dict[int, Codes]], factor: int, denoisers: set[str]) -> Stripe | None:

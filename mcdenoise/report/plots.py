@@ -18,14 +18,14 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLoc
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.labels import Box, place_labels
+from mcdenoise.report.labels import nearest, place_labels
 from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
 from mcdenoise.results import STAGES, Cost, Method, Results
 
 Layout = Literal["wide", "narrow"]
 
-# Okabe and Ito 2008: told apart with every kind of colour blindness.
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+# Okabe and Ito 2008, told apart with every kind of colour blindness; behind them four more, for ten models.
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f4fc9", "#8a4b20", "#6b8e00", "#c2185b")
 _BASELINE = "#767676"
 _STAGES = dict(zip(STAGES, ("#b5b5b5", "#56b4e9", "#0072b2", "#d55e00", "#8a8a8a"), strict=True))
 _INK, _MUTED, _RULE, _PAPER = "#1c1c1e", "#6b6b70", "#e2e2e4", "#fefefe"
@@ -408,21 +408,17 @@ def _label(
     places = [_pair(to_pixels(anchor)) for anchor in anchors]
     frame = axes.get_window_extent()
     left = min((x for x, _ in places), default=frame.x0) + 4 if right else frame.x0
-    obstacles = [Box(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    obstacles = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     for start, end in bars:
         (x0, y0), (x1, y1) = _pair(to_pixels(start)), _pair(to_pixels(end))
-        obstacles.append(Box(x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
-    boxes = place_labels(
-        places,
-        [(extent.width + 3, extent.height) for extent in extents],
-        Box(left, frame.y0, figure.bbox.x1, frame.y1),
-        obstacles,
-    )
+        obstacles.append((x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
+    sizes = [(extent.width + 3, extent.height) for extent in extents]
+    boxes = place_labels(places, sizes, (left, frame.y0, figure.bbox.x1, frame.y1), obstacles)
     for text, box, place in zip(texts, boxes, places, strict=True):
-        text.set_position(_pair(to_data(((box.left + box.right) / 2, (box.bottom + box.top) / 2))))
+        text.set_position(_pair(to_data(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2))))
         text.set_horizontalalignment("center")
         text.set_verticalalignment("center")
-        end = box.nearest(*place)
+        end = nearest(box, place)
         if math.dist(end, place) > _LEADER:
             line = zip(_pair(to_data(place)), _pair(to_data(end)), strict=True)
             axes.plot(*line, color=_MUTED, linewidth=0.5, zorder=2.5, clip_on=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
@@ -97,6 +98,37 @@ def views(results: Results) -> list[View]:
     return [View(f"mean of {len(scenes)} scenes", rows), *scenes]
 
 
+def shortlist(results: Results, most: int) -> Results:
+    """The results of the methods that a page shows, in the same order.
+
+    They are all, if they are few enough. Otherwise these, up to the number: the baselines; the best setting of each
+    model, the best model first; and the methods on the Pareto front of error and run time.
+
+    Args:
+        results: of a benchmark.
+        most: number of methods.
+
+    Raises:
+        InputError: see :func:`metrics`.
+    """
+    if len(results.methods) <= most:
+        return results
+    view, metric = views(results)[0], next(iter(metrics(results)), "")
+    sign = -1 if metric and METRICS[metric].higher_is_better else 1
+    ranked = sorted(view.rows, key=lambda row: sign * row.errors[metric].value if metric in row.errors else math.inf)
+    best = {row.method.model: row for row in reversed(ranked)}
+    baselines = [row for row in view.rows if row.method.kind == "baseline"]
+    wanted = [*baselines, *(row for row in ranked if row in best.values()), *front(view, metric)]
+    names = list(dict.fromkeys(row.method.name for row in wanted))[:most]
+    return replace(
+        results,
+        methods=[method for method in results.methods if method.name in names],
+        cells=[cell for cell in results.cells if cell.method in names],
+        costs=[cost for cost in results.costs if cost.method in names],
+        fits=[fit for fit in results.fits if fit.method in names],
+    )
+
+
 def metrics(results: Results) -> list[str]:
     """Names of the metrics that were computed, in the order of :data:`mcdenoise.evaluate.METRICS`.
 
@@ -120,6 +152,14 @@ def points(view: View, metric: str) -> list[Point]:
         for row in view.rows
         if row.milliseconds is not None and row.milliseconds.value > 0 and metric in row.errors
     ]
+
+
+def front(view: View, metric: str) -> list[Row]:
+    """The methods on the Pareto front of run time and error, by rising run time."""
+    shown = points(view, metric)
+    values = [(point.milliseconds.value, point.error.value) for point in shown]
+    higher = metric in METRICS and METRICS[metric].higher_is_better
+    return [shown[index].row for index in pareto_front(values, higher_is_better=higher)]
 
 
 def pareto_front(values: Sequence[tuple[float, float]], *, higher_is_better: bool = False) -> list[int]:

@@ -17,7 +17,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, data_uris, decode
-from mcdenoise.report.views import Range, Row, View, metrics, pareto_front, points, views
+from mcdenoise.report.views import Range, Row, View, front, metrics, shortlist, views
 from mcdenoise.results import STAGES, Kind, Results
 
 FILE = "index.html"
@@ -28,12 +28,15 @@ _PICTURE_BUDGET = 20_000_000
 _MOST_PIXELS = 60_000_000
 # The end of the heat map of SMAPE; larger errors look the same.
 _HEAT_END = 0.5
-# In place of a figure that is not known.
-_UNKNOWN = "\N{EN DASH}"
+# Methods of a page: more names than these cover one another in a plot.
+_MOST_METHODS = 12
 
 
 def write_report(folder: Path) -> Path:
     """Write ``index.html``, and ``plots/*.svg`` and ``plots/*.png``, from a finished benchmark.
+
+    At most a dozen methods are shown: baselines, the best setting of each model, and the Pareto front. The others are
+    named, and their figures are in ``results.csv``.
 
     The page is one file that needs no network and no server: an image comparer, close-ups, plots, tables that sort, and
     temporal profiles. Its pictures are 8-bit previews, and are made coarser or smaller where they would be more than 20
@@ -49,13 +52,16 @@ def write_report(folder: Path) -> Path:
         InputError: the results are missing or damaged, a picture is, a package of ``mcdenoise[report]`` is not
             installed, or a file cannot be written.
     """
-    results = Results.read(folder)
-    names = metrics(results)
+    everything = Results.read(folder)
+    names = metrics(everything)
     check_packages()
+    results = shortlist(everything, _MOST_METHODS)
     galleries = _galleries(folder, results)
     shown = views(results)
     content = {
         "results": results,
+        "others": [method.name for method in everything.methods if method not in results.methods],
+        "verdict": _verdict(shown[0] if shown else View("", []), names),
         "created": _date(results.created),
         "metrics": [_metric(name) for name in names],
         "columns": [_column(shown, name) for name in names],
@@ -63,7 +69,7 @@ def write_report(folder: Path) -> Path:
         "stages": STAGES,
         "number": _number,
         "plots": _write_plots(folder, results, shown, names),
-        "skipped": results.skipped(),
+        "skipped": everything.skipped(),
         "sizes": sorted({(cost.width, cost.height) for cost in results.costs}, key=lambda size: size[0] * size[1]),
         "costs": {(cost.method, cost.width, cost.height): cost for cost in results.costs},
         "fits": {fit.method: fit for fit in results.fits},
@@ -204,7 +210,9 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
                 described = f"{metric} over milliseconds a frame, {view.name}; the table below has the figures"
                 wide, narrow = (plots.error_over_time(view, metric, colors, layout) for layout in ("wide", "narrow"))
                 made = both(f"{metric.lower()}-{suffix}", described, wide, narrow)
-                errors.append({"view": place, "metric": metric, "front": _front(view, metric), **made})
+                errors.append(
+                    {"view": place, "metric": metric, "front": [row.method.name for row in front(view, metric)], **made}
+                )
             if not any(row.stages for row in view.rows):
                 continue
             described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
@@ -220,16 +228,6 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
         "colors": {model: plots.css_color(color) for model, color in colors.items()},
         "stage_colors": plots.stage_colors(),
     }
-
-
-def _front(view: View, metric: str) -> list[str]:
-    """Names on the Pareto front, by rising cost."""
-    shown = points(view, metric)
-    values = [(point.milliseconds.value, point.error.value) for point in shown]
-    return [
-        shown[index].row.method.name
-        for index in pareto_front(values, higher_is_better=METRICS[metric].higher_is_better)
-    ]
 
 
 def _file_name(name: str, place: int) -> str:
@@ -262,6 +260,7 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
             "width": gallery.scene.width // gallery.factor,
             "height": gallery.scene.height // gallery.factor,
             "frames": gallery.scene.pictures,
+            "exposure": gallery.exposure,
             # The frame of the close-ups, which has a reference, or else the last one.
             "start": gallery.scene.pictures.index(max(gallery.codes.get(REFERENCE) or gallery.scene.pictures)),
             "pictures": {
@@ -286,19 +285,39 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
     }
 
 
+def _best(view: View, names: list[str], kind: Kind) -> Row | None:
+    """The best method of a kind in the first metric; of those that are not trained, Open Image Denoise at its best."""
+    rows = [row for row in view.rows if row.method.kind == kind and names and names[0] in row.errors]
+    rows = [row for row in rows if row.method.model == "oidn"] or rows
+    sign = -1 if names and METRICS[names[0]].higher_is_better else 1
+    return min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
+
+
 def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
     """The pictures to begin with: Open Image Denoise at its best (or else the best filter), and the best network."""
     if not results.methods:
         return []
-    rows = [row for row in shown[0].rows if names and names[0] in row.errors]
-    sign = -1 if names and METRICS[names[0]].higher_is_better else 1
+    rival, ours = (_best(shown[0], names, kind) for kind in ("fixed", "trainable"))
+    return [rival.method.name if rival else results.methods[0].name, ours.method.name if ours else REFERENCE]
 
-    def best(kind: Kind, otherwise: str) -> str:
-        own = [row for row in rows if row.method.kind == kind]
-        own = [row for row in own if row.method.model == "oidn"] or own
-        return min(own, key=lambda row: sign * row.errors[names[0]].value).method.name if own else otherwise
 
-    return [best("fixed", results.methods[0].name), best("trainable", REFERENCE)]
+def _verdict(view: View, names: list[str]) -> str:
+    """The best network beside the best of the others, in a sentence; empty without one of them."""
+    rival, ours = (_best(view, names, kind) for kind in ("fixed", "trainable"))
+    if rival is None or ours is None:
+        return ""
+    one, other = (row.errors[names[0]].value for row in (ours, rival))
+    if METRICS[names[0]].higher_is_better:
+        text = f"{ours.method.name}: {names[0]} {one:.3g}, {rival.method.name}: {other:.3g}"
+    elif other <= 0:
+        return ""
+    else:
+        change = one / other - 1
+        text = f"{ours.method.name} has {abs(change):.0%} {'less' if change < 0 else 'more'} error ({names[0]}) than "
+        text += rival.method.name
+    if ours.milliseconds and rival.milliseconds and rival.milliseconds.value > 0:
+        text += f", in {ours.milliseconds.value / rival.milliseconds.value:.2g} times its time"
+    return f"{text}."
 
 
 def _featured(results: Results, shown: list[View], names: list[str]) -> set[str]:
@@ -323,12 +342,12 @@ def _column(shown: list[View], name: str) -> dict[str, Any]:
 
 
 def _number(value: Range | float | None, decimals: int | None = None) -> str:
-    """A figure of a table: a fixed number of decimals, or three digits; a dash for an unknown one."""
+    """A figure of a table: a fixed number of decimals, or three digits; empty for an unknown one."""
     if value is None:
-        return _UNKNOWN
+        return ""
     figure = value.value if isinstance(value, Range) else value
     if not math.isfinite(figure):
-        return "∞" if figure > 0 else _UNKNOWN
+        return "∞" if figure > 0 else ""
     if decimals is not None and abs(figure) < 100:
         return f"{figure:.{decimals}f}"
     return f"{figure:,.0f}" if abs(figure) >= 100 else f"{figure:.3g}"

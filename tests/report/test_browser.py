@@ -41,6 +41,7 @@ def open_page(browser: Any, page: Path, complaints: list[str], layout: str = "se
     ready(tab)
     tab.check(f"input[value={layout}]", force=True)
     tab.fill("#frame", "0")
+    tab.fill("#exposure", "0")
     ready(tab)
     return tab
 

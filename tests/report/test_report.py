@@ -111,6 +111,16 @@ def test_figures_are_those_of_the_results(folder: Path, outline: Outline):
     assert any(row.startswith(f"ours {cell.errors['SMAPE']:.4f} {cell.errors['PSNR']:.2f} 10") for row in rows)
 
 
+def test_the_verdict_comes_first_and_methods_that_are_left_out_are_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(report_writing, "_MOST_METHODS", 3)
+    (tmp_path / "results.json").write_text((folder / "results.json").read_text())
+    text = write_report(tmp_path).read_text()
+    assert re.search(r'<p class="lede"><strong>ours has \d+% less error \(SMAPE\) than .*, in 0.5 times its time', text)
+    assert re.search(r"2 more methods.*fails; absent", text, re.S)
+
+
 def test_the_setup_is_told(text: str):
     for part in ("a &lt;processor&gt;", "21 October 2026, 12:00 UTC", "torch 2.13.0", "2 of 2 cores", "0.0123"):
         assert part in text
@@ -125,6 +135,8 @@ def test_pictures_of_every_method_and_frame(text: str):
     assert all(list(own) == [str(frame) for frame in FRAMES] for own in first["pictures"].values())
     assert data["first"] == [HOSTILE, "ours"]
     assert first["start"] == len(FRAMES) - 1
+    # The reference is about 0.2 to 0.5, with a disc of 3: a middle gray is a stop darker or less.
+    assert -1.5 < first["exposure"] < 1
     assert data["linear"] == pytest.approx(decode(np.arange(256)), rel=1e-4)
 
 

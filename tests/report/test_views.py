@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from mcdenoise.errors import InputError
-from mcdenoise.report.views import Range, metrics, pareto_front, points, views
-from mcdenoise.results import Cell, Results, Spread
+from mcdenoise.report.views import Range, metrics, pareto_front, points, shortlist, views
+from mcdenoise.results import Cell, Method, Results, Spread
 
 
 def test_front_of_known_points():
@@ -82,3 +82,24 @@ def test_order_of_metrics_and_unknown_ones(folder: Path):
     results.cells.append(Cell("first", "ours", {"beauty": 1.0}, {"beauty": Spread.of([1.0])}))
     with pytest.raises(InputError, match="found beauty"):
         metrics(results)
+
+
+def test_a_page_has_the_best_setting_of_each_model_and_the_front(folder: Path):
+    results = Results.read(folder)
+    assert shortlist(results, len(results.methods)) is results
+    # Twenty settings of two models: errors fall with the number, and times rise with it but for the last two of ten.
+    for model, base in (("oidn", 0.5), ("late", 0.9)):
+        for number in range(10):
+            name = f"{model}({number})"
+            results.methods.append(Method(name, "fixed", name, model, {"number": number}))
+            error, time = base - number / 100, 1000.0 if number > 7 else number + (1 if model == "oidn" else 100)
+            for scene in ("first", "second"):
+                took = Spread(time, time, time, 1)
+                results.cells.append(Cell(scene, name, {"SMAPE": error}, {}, took, {"network": took}, computing=took))
+    names = [method.name for method in shortlist(results, 12).methods]
+    assert {"noisy", "ours", "oidn(0)", "late(9)"} <= set(names)
+    assert len(names) <= 12
+    assert names == [method.name for method in results.methods if method.name in names]
+    assert "late(3)" not in names
+    assert shortlist(results, 3).methods[0].name == "noisy"
+    assert {cell.method for cell in shortlist(results, 3).cells} <= {m.name for m in shortlist(results, 3).methods}

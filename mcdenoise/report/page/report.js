@@ -321,7 +321,7 @@ function startComparer() {
     element("frame").max = scene().frames.length - 1;
     const frame = clamp(wanted.frame ?? state.frame ?? scene().start, 0, scene().frames.length - 1);
     const center = { x: scene().width / 2, y: scene().height / 2 };
-    change({ zoom: 1, center, ...wanted, frame });
+    change({ zoom: 1, center, exposure: scene().exposure, ...wanted, frame });
   }
 
   /* Zoom and pan: what is under the pointer stays under it. */
@@ -458,7 +458,7 @@ function startComparer() {
     ".": () => step(1),
     "[": () => expose(-0.5),
     "]": () => expose(0.5),
-    "\\": () => change({ exposure: 0 }),
+    "\\": () => change({ exposure: scene().exposure }),
     " ": play,
     e: () => change({ show: state.show === "error" ? "picture" : "error" }),
     s: () => change({ layout: state.layout === "seam" ? "beside" : "seam" }),
