@@ -51,11 +51,22 @@ def seed() -> None:
 
 @pytest.fixture
 def small_sequence(tmp_path: Path) -> Path:
-    """A scene folder in the bmfr layout: 4 frames, 24 x 20 pixels, a moving camera above a floor, sky at the top.
+    """A scene folder of :func:`write_small_sequence`, for one test."""
+    return write_small_sequence(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def shared_sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for all tests, none of which writes to it."""
+    return write_small_sequence(tmp_path_factory.mktemp("shared"))
+
+
+def write_small_sequence(folder: Path) -> Path:
+    """Write a scene folder in the bmfr layout: 4 frames, 24 x 20 pixels, a moving camera above a floor, sky at the top.
 
     A strip of the floor is a mirror (no albedo, but a normal). Color is noisy radiance; its mean is the reference.
     """
-    inputs = tmp_path / "plane" / "inputs"
+    inputs = folder / "plane" / "inputs"
     cameras = [_camera(number) for number in range(FRAMES)]
     for number, (eye, axes, focal, _) in enumerate(cameras):
         write_bmfr_frame(inputs, number, _render(eye, axes, focal, seed=number))

@@ -337,7 +337,7 @@ def test_a_command_that_does_not_exist_or_fails_is_an_error(tmp_path: Path) -> N
     machine.__enter__()
     while not failed.exists():
         time.sleep(0.05)
-    time.sleep(2)
+    time.sleep(1)
     with pytest.raises(InputError, match="found status 3; run it by itself"):
         machine.__exit__(None, None, None)
 
@@ -434,6 +434,7 @@ def test_missing_methods_are_listed_as_missing(
     small_sequence: Path, weights: Path, out: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    out.mkdir()
     file = out.parent / "copy.json"
     models = f"{__name__}:half,{__name__}:absent(quality=fast|high),{weights}"
     status, printed, errors = run(
@@ -484,23 +485,17 @@ def test_missing_methods_are_listed_as_missing(
     assert by_method[missing[0]]["SMAPE"] == ""
 
 
-def test_a_model_that_fails_is_a_row_and_exit_status_1(
-    small_sequence: Path, out: Path, run: Callable[..., Any]
-) -> None:
-    model = create_model("cascaded_v2", width=4)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.copy_(torch.randn_like(parameter).sign() * 6e4)
-    path = out.parent / "wild.safetensors"
-    path.write_bytes(save_weights(model, "cascaded_v2", {"width": 4}, {}))
-    arguments = ("--models", path, "--precisions", "float32", "--rounds", 1, "--sizes", "none")
-    status, printed, errors = run(small_sequence, "-o", out, *arguments)
+def overflowing() -> Any:
+    return lambda color: color * torch.inf
+
+
+def test_a_method_that_fails_gives_exit_status_1(small_sequence: Path, out: Path, run: Callable[..., Any]) -> None:
+    models = ("--models", f"{__name__}:overflowing", "--frames", "0", "--pictures", 0)
+    status, printed, errors = run(small_sequence, "-o", out, *models, "--rounds", 1, "--sizes", "none")
     assert (status, errors) == (1, "")
-    noisy, accumulated, wild = Results.read(out).cells
-    assert noisy.errors
-    assert accumulated.errors
-    assert wild.failure.startswith("model: expected finite radiance, found ")
-    assert f"failed: plane, {wild.method}: {wild.failure}\n" in printed
+    *_, failed = Results.read(out).cells
+    assert failed.failure == NOT_FINITE
+    assert f"failed: plane, {failed.method}: {failed.failure}\n" in printed
 
 
 def demanding() -> Any:
@@ -534,17 +529,6 @@ def test_a_method_is_skipped_on_scenes_that_lack_its_buffers(
     # Any other error is a failure.
     assert Results.read(out).cells[2].reason == f"skipped: {lacking['svgf']}"
     assert Cell("plane", "svgf", failure="out of luck").reason == "failed: out of luck"
-
-
-def test_an_empty_folder_is_accepted(small_sequence: Path, out: Path, run: Callable[..., Any]) -> None:
-    out.mkdir()
-    status, _, _ = run(
-        *(small_sequence, "-o", out, "--models", "none", "--frames", "0-1", "--rounds", 1, "--sizes", "none")
-    )
-    assert status == 0
-    assert Results.read(out).cells
-    assert (out / "index.html").is_file()
-    assert not list(out.glob(".*"))
 
 
 @pytest.mark.parametrize(
@@ -629,30 +613,6 @@ def test_all_means_every_model() -> None:
     assert reasons.pop().startswith("expected shipped weights, found them only for: cascaded_v2")
     default = [method.name for method in choose_methods(precisions="float32")]
     assert [method.name for method in methods if method.name in default] == default
-
-
-def test_every_model_on_two_scenes(small_sequence: Path, out: Path, tmp_path: Path) -> None:
-    """No model fails with random weights; models whose buffers a scene lacks are skipped with the reason."""
-    poor = tmp_path / "poor"
-    shutil.copytree(small_sequence, poor)
-    for stem in ("shading_normal", "world_position"):
-        for path in (poor / "inputs").glob(f"{stem}*"):
-            path.unlink()
-    spellings = []
-    for name in list_models():
-        model, path = create_model(name), tmp_path / f"{name}.safetensors"
-        untrained = model.needs.trainable and name not in {*pretrained_models(), *compared_models()}
-        if untrained:
-            path.write_bytes(save_weights(model, name, {}, {}))
-        spellings.append(str(path) if untrained else name)
-    methods = choose_methods(",".join(spellings), precisions="float32")
-    assert {method.name for method in methods} == set(list_models())
-    sequences = [open_sequence(folder, "0-1") for folder in (small_sequence, poor)]
-    results = run_benchmark(sequences, methods, out, Settings(rounds=0, metrics=("SMAPE",), pictures=0, memory=False))
-    assert not [cell for cell in results.cells if cell.failure and not cell.lacking]
-    assert len(results.cells) == 2 * len(list_models())
-    lacking = {(cell.scene, cell.method) for cell in results.cells if cell.lacking}
-    assert lacking == {("poor", name) for name in ("asvgf", "bmfr", "oidn_open", "svgf")}
 
 
 def test_some_methods_in_some_precisions() -> None:
@@ -883,12 +843,14 @@ def test_pictures_are_of_successive_frames_up_to_one_with_a_reference(
 
 def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
-    results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=OPS)
+    names = ("kernel_conv", "downsample", "upsample", "reproject", "demodulate")
+    ops = [each for each in OPS if each.name in names]
+    results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=ops)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
     # Their fast backends have no derivatives.
     forward = ("downsample", "importance_filter", "motion_from_position", "reproject", "resample")
     by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
-    assert list(by_name) == [(op.name, dtype) for op in OPS for dtype in limits]
+    assert list(by_name) == [(op.name, dtype) for op in ops for dtype in limits]
     # Another backend may not run here.
     assert not any(cost.failure for cost in by_name.values())
     for cost in (cost for cost in results.costs if not cost.failure):

@@ -8,13 +8,14 @@ import io
 import json
 import os
 import platform
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import textwrap
-import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ from mcdenoise.train.data import DataFolders, TrainingData
 from mcdenoise.train.front import split
 
 SMALL: dict[str, Any] = {"width": 4, "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
+FIELDS = {field.name for field in dataclasses.fields(TrainConfig)}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -49,6 +51,39 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def finished(shared_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run, which no test changes."""
+    run = tmp_path_factory.mktemp("finished") / "deep" / "run"
+    train(TrainConfig(**SMALL), [shared_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
+    return run
+
+
+@pytest.fixture
+def again(finished: Path, shared_sequence: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Go on with a copy of the finished run, ``run``, with other settings, data or options."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run, ignore=shutil.ignore_patterns("cache", "events*"))
+
+    def go_on(*sequences: Path, **changed: Any) -> Path:
+        config = TrainConfig(**{**SMALL, **{key: changed.pop(key) for key in changed.keys() & FIELDS}})
+        options = {"checkpoint_every": 2, "credits": "A. Painter, CC0", "cache": finished / "cache", **changed}
+        return train(config, list(sequences) or [shared_sequence], run, **options)
+
+    return go_on
+
+
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """The system refuses longer files, as it refuses to write to a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 class Stopped(Exception):
@@ -89,7 +124,7 @@ def state(run: Path) -> list[Tensor]:
 # Runs
 
 
-def test_one_clip_is_learnt_by_heart(small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_clip_is_learnt_by_heart(shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     draw, clips, reports = ClipSampler.draw, [], []
 
     def draw_once(sampler: ClipSampler, seeds: list[int]) -> Clip:
@@ -100,18 +135,14 @@ def test_one_clip_is_learnt_by_heart(small_sequence: Path, tmp_path: Path, monke
     config = TrainConfig(
         **{**SMALL, "width": 8, "frames": 3, "batch": 1, "steps": 30}, learning_rate=1e-2, draw_resolutions=False
     )
-    train(config, [small_sequence], tmp_path / "run", checkpoint_every=5, report=reports.append)
-    assert [progress.step for progress in reports] == [5, 10, 15, 20, 25, 30]
-    # 0.400 to 0.218 was measured.
+    train(config, [shared_sequence], tmp_path / "run", checkpoint_every=10, report=reports.append)
+    assert [progress.step for progress in reports] == [10, 20, 30]
     assert reports[-1].loss < 0.8 * reports[0].loss
     assert set(reports[-1].validation) == {"smape", "psnr", "initial_smape", "initial_psnr"}
 
 
-@pytest.mark.parametrize("schedule", ["constant", "cosine"])
-def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
-    small_sequence: Path, tmp_path: Path, schedule: str
-) -> None:
-    config = TrainConfig(**SMALL, schedule=schedule, gradient_norm=1.0, ema=0.9)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(shared_sequence: Path, tmp_path: Path) -> None:
+    config = TrainConfig(**SMALL, schedule="cosine", gradient_norm=1.0, ema=0.9, exposure=1.0)
     steps: list[int] = []
 
     def stop_at_3(progress: Progress) -> None:
@@ -119,32 +150,27 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
         if progress.step == 3:
             raise Stopped
 
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    weights = train(config, [small_sequence], whole, checkpoint_every=3)
+    whole, stopped, cache = tmp_path / "whole", tmp_path / "stopped", tmp_path / "cache"
+    weights = train(config, [shared_sequence], whole, cache=cache, checkpoint_every=3)
     with pytest.raises(Stopped):
-        train(config, [small_sequence], stopped, checkpoint_every=3, report=stop_at_3)
+        train(config, [shared_sequence], stopped, cache=cache, checkpoint_every=3, report=stop_at_3)
     assert not (stopped / f"{DEFAULT}.safetensors").exists()
     torch.manual_seed(99)
-    resumed = train(config, [small_sequence], stopped, checkpoint_every=3, report=lambda p: steps.append(p.step))
+    go_on: dict[str, Any] = {"cache": cache, "checkpoint_every": 3, "report": lambda p: steps.append(p.step)}
+    resumed = train(config, [shared_sequence], stopped, **go_on)
     assert steps == [3, 6]
     expected, actual = state(whole), state(stopped)
     assert len(actual) == len(expected) > 100
     assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
-    assert describe_weights(resumed)["sha256"] == describe_weights(weights)["sha256"]
+    digest = describe_weights(resumed)["sha256"]
+    assert digest == describe_weights(weights)["sha256"]
+    # A finished run is not run again.
+    assert train(config, [shared_sequence], stopped, **go_on) == resumed
+    assert (steps, describe_weights(resumed)["sha256"]) == ([3, 6], digest)
 
 
-def test_a_finished_run_is_not_run_again(small_sequence: Path, tmp_path: Path) -> None:
-    config, steps = TrainConfig(**SMALL), []
-    weights = train(config, [small_sequence], tmp_path / "run")
-    digest = describe_weights(weights)["sha256"]
-    again = train(config, [small_sequence], tmp_path / "run", report=lambda progress: steps.append(progress.step))
-    assert (again, steps, describe_weights(again)["sha256"]) == (weights, [], digest)
-
-
-def test_files_of_a_finished_run(small_sequence: Path, tmp_path: Path) -> None:
-    run = tmp_path / "deep" / "run"
-    weights = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
-    assert weights == run / f"{DEFAULT}.safetensors"
+def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
+    run, weights = finished, finished / f"{DEFAULT}.safetensors"
     names = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
     assert names == {
         "cache",
@@ -159,7 +185,7 @@ def test_files_of_a_finished_run(small_sequence: Path, tmp_path: Path) -> None:
     config = json.loads((run / "config.json").read_text())
     assert TrainConfig(**config) == TrainConfig(**SMALL)
     digest = hashlib.sha256()
-    sequence = open_sequence(small_sequence)
+    sequence = open_sequence(shared_sequence)
     for number in sequence.numbers:
         frame = sequence.frame(number)
         assert frame.reference is not None
@@ -187,15 +213,15 @@ def test_files_of_a_finished_run(small_sequence: Path, tmp_path: Path) -> None:
         assert torch.equal(tensor, saved[key].half().float())
 
 
-def test_bfloat16_learns_float32_weights(small_sequence: Path, tmp_path: Path) -> None:
-    train(TrainConfig(**{**SMALL, "steps": 2}, precision="bfloat16"), [small_sequence], tmp_path / "run")
+def test_bfloat16_learns_float32_weights(shared_sequence: Path, tmp_path: Path) -> None:
+    train(TrainConfig(**{**SMALL, "steps": 2}, precision="bfloat16"), [shared_sequence], tmp_path / "run")
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["parts"][0]
     assert {tensor.dtype for tensor in saved.values()} == {torch.float32}
     assert all(torch.isfinite(tensor).all() for tensor in saved.values())
 
 
 def test_a_step_has_as_many_resolutions_as_are_drawn(
-    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[tuple[bool, int]] = []
     forward = CoarseToFine.forward
@@ -205,24 +231,26 @@ def test_a_step_has_as_many_resolutions_as_are_drawn(
         return forward(self, *arguments, **named)
 
     monkeypatch.setattr(CoarseToFine, "forward", spy)
-    settings = {**SMALL, "steps": 12}
-    train(TrainConfig(**settings), [small_sequence], tmp_path / "drawn")
+    settings, cache = {**SMALL, "steps": 12}, tmp_path / "cache"
+    train(TrainConfig(**settings), [shared_sequence], tmp_path / "drawn", cache=cache)
     drawn = [resolutions for training, resolutions in seen if training]
     assert set(drawn) == {1, 2, 3}
     assert {resolutions for training, resolutions in seen if not training} == {3}
     # The same again: a run goes on as if it had not been stopped.
     seen.clear()
-    train(TrainConfig(**settings), [small_sequence], tmp_path / "again")
-    assert [resolutions for training, resolutions in seen if training] == drawn
+    train(TrainConfig(**{**settings, "steps": 3}), [shared_sequence], tmp_path / "again", cache=cache)
+    again = [resolutions for training, resolutions in seen if training]
+    assert again == drawn[: len(again)]
     seen.clear()
-    train(TrainConfig(**settings, draw_resolutions=False), [small_sequence], tmp_path / "all")
+    every = TrainConfig(**{**settings, "steps": 2}, draw_resolutions=False)
+    train(every, [shared_sequence], tmp_path / "all", cache=cache)
     assert {resolutions for _, resolutions in seen} == {3}
 
 
-def test_frames_held_back_are_not_trained_on(small_sequence: Path, tmp_path: Path) -> None:
+def test_frames_held_back_are_not_trained_on(shared_sequence: Path, tmp_path: Path) -> None:
     def lengths(**changes: Any) -> tuple[list[int], list[int]]:
         config = TrainConfig(**{**SMALL, **changes})
-        data = data_of(config, small_sequence, cache=tmp_path / "cache")
+        data = data_of(config, shared_sequence, cache=tmp_path / "cache")
         return [len(shot) for shot in data.sampler.shots], [len(shot) for _, shot in data.watched]
 
     # Shots of 4, 3, 2 and 1 frames, each without the last frames; none too short for a clip is kept.
@@ -247,7 +275,7 @@ def test_every_noise_seed_of_the_noise_is_trained_on(small_sequence: Path, tmp_p
     assert len(data.watched[1][1].colors) == 1
 
 
-def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_path: Path) -> None:
+def test_the_log_of_a_stopped_run_has_every_step_once(shared_sequence: Path, tmp_path: Path) -> None:
     config, log = TrainConfig(**SMALL), tmp_path / "run" / "log.jsonl"
 
     def stop_at_4(progress: Progress) -> None:
@@ -257,7 +285,7 @@ def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_
             raise Stopped
 
     with pytest.raises(Stopped):
-        train(config, [small_sequence], tmp_path / "run", checkpoint_every=2, report=stop_at_4)
+        train(config, [shared_sequence], tmp_path / "run", checkpoint_every=2, report=stop_at_4)
     # The run is left as if the last checkpoint had been that of step 2.
     saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
     saved["step"] = 2
@@ -265,7 +293,7 @@ def test_the_log_of_a_stopped_run_has_every_step_once(small_sequence: Path, tmp_
     torch.save(saved, content)
     sealed = content.getvalue() + hashlib.sha256(content.getvalue()).digest()
     (tmp_path / "run" / "checkpoint.pt").write_bytes(sealed)
-    train(config, [small_sequence], tmp_path / "run", checkpoint_every=2)
+    train(config, [shared_sequence], tmp_path / "run", checkpoint_every=2)
     entries = [json.loads(line) for line in log.read_text().splitlines()]
     assert [entry.get("step", entry.get("first_step")) for entry in entries] == [0, 2, 2, 4, 6]
 
@@ -299,7 +327,7 @@ def test_sequences_that_are_only_watched(small_sequence: Path, tmp_path: Path) -
     assert reports[1].validation["smape"] == pytest.approx(sum(errors) / 4, abs=1e-3)
 
 
-def test_averaged_weights_are_what_is_validated_and_kept(small_sequence: Path, tmp_path: Path) -> None:
+def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
     config = TrainConfig(**{**SMALL, "ema": 0.5, "learning_rate": 1e-2, "steps": 3})
     trajectory: list[dict[str, Tensor]] = []
 
@@ -307,7 +335,7 @@ def test_averaged_weights_are_what_is_validated_and_kept(small_sequence: Path, t
         saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["parts"][0]
         trajectory.append({key: tensor.clone() for key, tensor in saved.items()})
 
-    weights = train(config, [small_sequence], tmp_path / "run", checkpoint_every=1, report=remember)
+    weights = train(config, [shared_sequence], tmp_path / "run", checkpoint_every=1, report=remember)
     final = load_weights(weights).state_dict()
     for key, tensor in trajectory[0].items():
         expected = tensor
@@ -336,66 +364,47 @@ def options(config: TrainConfig) -> list[str]:
 ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
-def test_a_killed_run_goes_on_to_the_same_weights(small_sequence: Path, tmp_path: Path) -> None:
-    config = TrainConfig(**{**SMALL, "steps": 60, "ema": 0.9}, schedule="cosine", gradient_norm=1.0, exposure=1.0)
-    run, cache = tmp_path / "killed", tmp_path / "cache"
-    command = mcdenoise("train", small_sequence, "-o", run, "--cache", cache, "--checkpoint-every", 5, *options(config))
-    process = subprocess.Popen(command, env=ONE_THREAD, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (run / "checkpoint.pt").exists():
-        assert process.poll() is None
-        time.sleep(0.005)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
-    assert not (run / f"{DEFAULT}.safetensors").exists()
-    assert 0 < torch.load(run / "checkpoint.pt", weights_only=True)["step"] < 60
-
-    whole = train(config, [small_sequence], tmp_path / "whole", cache=cache, checkpoint_every=60)
-    resumed = train(config, [small_sequence], run, cache=cache, checkpoint_every=5)
-    expected_weights, actual_weights = load_file(whole), load_file(resumed)
-    assert actual_weights.keys() == expected_weights.keys()
-    assert all(torch.equal(tensor, expected_weights[key]) for key, tensor in actual_weights.items())
-    expected, actual = state(tmp_path / "whole"), state(run)
-    assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
-
-
-def test_a_run_killed_while_it_saves_keeps_the_checkpoint_before(small_sequence: Path, tmp_path: Path) -> None:
+def test_a_run_killed_while_it_saves_goes_on_from_the_checkpoint_before(
+    again: Callable[..., Path], finished: Path, shared_sequence: Path, tmp_path: Path
+) -> None:
     code = """
         import os, signal, sys
-        from pathlib import Path
+        from mcdenoise.cli import main
         from mcdenoise.data import files
-        from mcdenoise.train import TrainConfig, train
         replace, saved = os.replace, []
         def killed(source, target):
-            saved.append(Path(target).name)
+            saved.append(os.path.basename(target))
             if saved.count("checkpoint.pt") == 2:
                 os.kill(os.getpid(), signal.SIGKILL)
             replace(source, target)
         files.os.replace = killed
-        config = TrainConfig(width=4, crop=16, frames=2, batch=2, steps=3, validation_frames=1)
-        train(config, [Path(sys.argv[1])], Path(sys.argv[2]), checkpoint_every=1)
+        main(["train", *sys.argv[1:]])
     """
     run = tmp_path / "run"
-    command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(run)]
-    assert subprocess.run(command, env=ONE_THREAD, check=False).returncode == -signal.SIGKILL
-    assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 1
+    for path in run.iterdir():
+        path.unlink()
+    place = [shared_sequence, "-o", run, "--cache", finished / "cache"]
+    command = [sys.executable, "-c", textwrap.dedent(code), *place]
+    command += ["--checkpoint-every", "2", "--credits", "A. Painter, CC0", *options(TrainConfig(**SMALL))]
+    assert subprocess.run(list(map(str, command)), env=ONE_THREAD, check=False).returncode == -signal.SIGKILL
+    assert not (run / f"{DEFAULT}.safetensors").exists()
+    assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
     (left,) = run.glob(".mcdenoise*")
     os.utime(left, (0, 0))
-    config = TrainConfig(**{**SMALL, "steps": 3})
-    resumed = train(config, [small_sequence], run, checkpoint_every=1)
-    whole = train(config, [small_sequence], tmp_path / "whole", checkpoint_every=1)
-    assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
+    weights = again()
+    assert describe_weights(weights)["sha256"] == describe_weights(finished / weights.name)["sha256"]
     assert not left.exists()
 
 
 @pytest.mark.slow
-def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path) -> None:
+def test_two_processes_learn_what_one_does(shared_sequence: Path, tmp_path: Path) -> None:
     settings = {**SMALL, "batch": 4, "steps": 4, "ema": 0.9, "losses": "image=1,initial=0.5"}
     config = TrainConfig(**settings, gradient_norm=0.5, lamps=0.5, exposure=1.0)
     weights = []
     # Both with one thread a process: with more, sums are taken in another order again.
     for run, processes in ((tmp_path / "one", 1), (tmp_path / "two", 2)):
         options_of_run = ("-o", run, "--checkpoint-every", 1, *options(config))
-        command = mcdenoise("train", small_sequence, *options_of_run, processes=processes)
+        command = mcdenoise("train", shared_sequence, *options_of_run, processes=processes)
         result = subprocess.run(command, env=ONE_THREAD, capture_output=True, text=True, check=False)
         assert result.returncode == 0, result.stderr
         assert result.stdout.split() == [str(run / f"{DEFAULT}.safetensors")]
@@ -426,124 +435,100 @@ def test_two_processes_learn_what_one_does(small_sequence: Path, tmp_path: Path)
 # Refusals
 
 
-def test_another_config_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
+def test_another_config_or_other_data_need_another_folder(
+    again: Callable[..., Path], shared_sequence: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], run)
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     # One with another cache, too, which must not be filled for nothing.
-    message = refused(
-        lambda: train(TrainConfig(**{**SMALL, "steps": 2, "settings": "alpha_min=0.5"}), [small_sequence], run)
-    )
+    message = refused(lambda: again(steps=2, settings="alpha_min=0.5", cache=tmp_path / "cache"))
     assert (
-        f"{run / 'config.json'}: expected settings='alpha_min=0.5', steps=2 as in this run, found settings='', steps=1"
+        f"{run / 'config.json'}: expected settings='alpha_min=0.5', steps=2 as in this run, found settings=''"
         in message
     )
+    assert not (tmp_path / "cache").exists()
+    assert f"{run / 'data.json'}: expected sequences=" in refused(lambda: again(shared_sequence, shared_sequence))
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="has no file names but UTF-8")
-def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(small_sequence: Path, tmp_path: Path) -> None:
+def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(shared_sequence: Path, tmp_path: Path) -> None:
     run = tmp_path / "M\udcfcller"
-    assert "whose name is UTF-8" in refused(lambda: train(TrainConfig(**SMALL), [small_sequence], run))
+    assert "whose name is UTF-8" in refused(lambda: train(TrainConfig(**SMALL), [shared_sequence], run))
     assert not run.exists()
 
 
-def test_other_data_needs_another_folder(small_sequence: Path, tmp_path: Path) -> None:
-    config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
-    train(config, [small_sequence], run)
-    assert f"{run / 'data.json'}: expected sequences=" in refused(lambda: train(config, [small_sequence] * 2, run))
-
-
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x02}q\x00.", None])
-def test_a_damaged_checkpoint_is_refused(small_sequence: Path, tmp_path: Path, content: bytes | None) -> None:
-    config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
-    train(config, [small_sequence], run)
-    checkpoint = run / "checkpoint.pt"
+def test_a_damaged_checkpoint_is_refused(again: Callable[..., Path], tmp_path: Path, content: bytes | None) -> None:
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:-500] if content is None else content)
-    message = refused(lambda: train(config, [small_sequence], run))
+    message = refused(again)
     assert message.startswith(f"{checkpoint}: expected a checkpoint of this run")
     assert "remove it" in message
 
 
-def test_no_flipped_bit_of_a_checkpoint_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
-    config, run = TrainConfig(**{**SMALL, "steps": 1}), tmp_path / "run"
-    train(config, [small_sequence], run)
-    content = (run / "checkpoint.pt").read_bytes()
-    folder, parts = RunFolder(run), [torch.nn.Linear(1, 1)]
-    for bit in np.random.default_rng(0).integers(8 * len(content), size=200):
+def test_no_flipped_bit_of_a_checkpoint_is_trained_on(finished: Path, tmp_path: Path) -> None:
+    content = (finished / "checkpoint.pt").read_bytes()
+    folder, parts = RunFolder(tmp_path), [torch.nn.Linear(1, 1)]
+    for bit in np.random.default_rng(0).integers(8 * len(content), size=50):
         damaged = bytearray(content)
         damaged[bit // 8] ^= 1 << bit % 8
-        (run / "checkpoint.pt").write_bytes(damaged)
+        (tmp_path / "checkpoint.pt").write_bytes(damaged)
         assert "found one that is damaged" in refused(lambda: folder.load(*parts))
 
 
-def test_two_trainings_do_not_share_a_folder(small_sequence: Path, tmp_path: Path) -> None:
+def test_two_trainings_do_not_share_a_folder(shared_sequence: Path, tmp_path: Path) -> None:
     config, run, messages = TrainConfig(**{**SMALL, "steps": 2}), tmp_path / "run", []
 
     def again(progress: Progress) -> None:
         if not messages:
             log = (run / "log.jsonl").read_bytes()
-            messages.append(refused(lambda: train(config, [small_sequence], run, checkpoint_every=1)))
+            messages.append(refused(lambda: train(config, [shared_sequence], run, checkpoint_every=1)))
             assert (run / "log.jsonl").read_bytes() == log
 
-    train(config, [small_sequence], run, checkpoint_every=1, report=again)
+    train(config, [shared_sequence], run, checkpoint_every=1, report=again)
     assert messages == [
         f"{run}: expected a folder that no other training writes to, found process {os.getpid()} of "
         f"{platform.node()} at work in it; wait for it, or choose another folder"
     ]
     # It is free again.
     (run / f"{DEFAULT}.safetensors").unlink()
-    train(config, [small_sequence], run, checkpoint_every=1)
+    train(config, [shared_sequence], run, checkpoint_every=1)
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(small_sequence: Path, tmp_path: Path) -> None:
-    config = TrainConfig(**{**SMALL, "steps": 1})
-    train(config, [small_sequence], tmp_path / "run")
-    train(TrainConfig(**{**SMALL, "steps": 1, "model": "cascaded_v2_tiny"}), [small_sequence], tmp_path / "tiny")
-    train(TrainConfig(**{**SMALL, "steps": 1, "ema": 0.5}), [small_sequence], tmp_path / "average")
-    for other in ("tiny", "average"):
-        shutil.copyfile(tmp_path / other / "checkpoint.pt", tmp_path / "run" / "checkpoint.pt")
-        message = refused(lambda: train(config, [small_sequence], tmp_path / "run"))
-        assert message.startswith(f"{tmp_path / 'run' / 'checkpoint.pt'}: expected a checkpoint of this run")
+@pytest.mark.parametrize("changed", [{"model": "cascaded_v2_tiny"}, {"ema": 0.5}], ids=["model", "average"])
+def test_a_checkpoint_of_another_architecture_is_refused(
+    again: Callable[..., Path], shared_sequence: Path, finished: Path, tmp_path: Path, changed: dict[str, Any]
+) -> None:
+    other = TrainConfig(**{**SMALL, "steps": 1, **changed})
+    train(other, [shared_sequence], tmp_path / "other", cache=finished / "cache")
+    shutil.copyfile(tmp_path / "other" / "checkpoint.pt", tmp_path / "run" / "checkpoint.pt")
+    assert refused(again).startswith(f"{tmp_path / 'run' / 'checkpoint.pt'}: expected a checkpoint of this run")
 
 
-def test_a_full_disk_keeps_the_checkpoint_before(small_sequence: Path, tmp_path: Path) -> None:
-    code = """
-        import resource, sys
-        from pathlib import Path
-        from mcdenoise.errors import InputError
-        from mcdenoise.train import TrainConfig, train
-        def fill_disk(progress):
-            resource.setrlimit(resource.RLIMIT_FSIZE, (50000, 50000))
-        config = TrainConfig(width=4, crop=16, frames=2, batch=2, steps=6, validation_frames=1)
-        try:
-            train(config, [Path(sys.argv[1])], Path(sys.argv[2]), checkpoint_every=2, report=fill_disk)
-        except InputError as error:
-            print(error)
-    """
+def test_a_full_disk_keeps_the_checkpoint_before(again: Callable[..., Path], finished: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    command = [sys.executable, "-c", textwrap.dedent(code), str(small_sequence), str(run)]
-    result = subprocess.run(command, env=ONE_THREAD, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith(f"{run / 'checkpoint.pt'}: cannot be written (File too large)")
-    assert result.stdout.count("\n") == 1
+    for path in run.iterdir():
+        path.unlink()
+    with ExitStack() as stack:
+        message = refused(lambda: again(report=lambda progress: stack.enter_context(full_disk(50_000))))
+    assert message.startswith(f"{run / 'checkpoint.pt'}: cannot be written (File too large)")
     assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
     assert not list(run.glob(".mcdenoise*"))
-    resumed = train(TrainConfig(**SMALL), [small_sequence], run, checkpoint_every=2)
-    whole = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "whole")
-    assert describe_weights(resumed)["sha256"] == describe_weights(whole)["sha256"]
+    weights = again()
+    assert describe_weights(weights)["sha256"] == describe_weights(finished / weights.name)["sha256"]
 
 
 def test_a_gradient_that_is_not_finite_is_not_learnt_from(
-    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torch.nn.utils.clip_grad_norm_", lambda *args, **kwargs: torch.tensor(torch.inf))
-    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
+    message = refused(lambda: train(TrainConfig(**SMALL), [shared_sequence], tmp_path / "run"))
     assert "training, step 0: expected a finite gradient, found inf" in message
 
 
 @pytest.mark.parametrize("stem", ["color", "reference"])
-@pytest.mark.parametrize("value", [3e38, 1e37, 9e15, 1e12, np.nan])
+@pytest.mark.parametrize("value", [3e38, 9e15, np.nan])
 def test_an_absurdly_bright_pixel_does_not_stop_a_run(
     small_sequence: Path, tmp_path: Path, value: float, stem: str
 ) -> None:
@@ -558,12 +543,12 @@ def test_an_absurdly_bright_pixel_does_not_stop_a_run(
 
 
 def test_a_batch_that_the_processes_cannot_divide_is_refused(
-    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     launched = {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "3"}
     for name, value in launched.items():
         monkeypatch.setenv(name, value)
-    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], tmp_path / "run"))
+    message = refused(lambda: train(TrainConfig(**SMALL), [shared_sequence], tmp_path / "run"))
     assert "batch: expected a multiple of the 6 processes, found 2" in message
 
 
@@ -662,10 +647,10 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
     ],
 )
 def test_settings_that_cannot_be_leave_no_run(
-    small_sequence: Path, tmp_path: Path, setting: str, value: Any, expected: str
+    shared_sequence: Path, tmp_path: Path, setting: str, value: Any, expected: str
 ) -> None:
     config = TrainConfig(**{**SMALL, setting: value})
-    assert expected in refused(lambda: train(config, [small_sequence], tmp_path / "run"))
+    assert expected in refused(lambda: train(config, [shared_sequence], tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
@@ -687,37 +672,30 @@ def test_only_exact_features(small_sequence: Path, tmp_path: Path) -> None:
     assert "exact_features: expected a sequence with features without noise to train on, found none among 1" in message
 
 
-def test_a_folder_or_an_accelerator_that_cannot_be(small_sequence: Path, tmp_path: Path) -> None:
+def test_a_folder_or_an_accelerator_that_cannot_be(shared_sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     config = TrainConfig(**SMALL)
-    message = refused(lambda: train(config, [small_sequence], tmp_path / "file" / "run"))
+    message = refused(lambda: train(config, [shared_sequence], tmp_path / "file" / "run"))
     assert f"{tmp_path / 'file' / 'run' / 'cache'}" in message
-    message = refused(lambda: train(config, [small_sequence], tmp_path / "file" / "run", cache=tmp_path / "cache"))
+    message = refused(lambda: train(config, [shared_sequence], tmp_path / "file" / "run", cache=tmp_path / "cache"))
     assert "expected a folder to write the run to" in message
     for accelerator in ("abacus", "tpu"):
-        message = refused(lambda a=accelerator: train(config, [small_sequence], tmp_path / "run", accelerator=a))
+        message = refused(lambda a=accelerator: train(config, [shared_sequence], tmp_path / "run", accelerator=a))
         assert f"accelerator '{accelerator}': expected one that works here" in message
-    message = refused(lambda: train(config, [small_sequence], tmp_path / "run", checkpoint_every=0))
+    message = refused(lambda: train(config, [shared_sequence], tmp_path / "run", checkpoint_every=0))
     assert "checkpoint_every: expected at least 1, found 0" in message
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_can_start_from_weights(small_sequence: Path, tmp_path: Path) -> None:
-    first = train(TrainConfig(**SMALL), [small_sequence], tmp_path / "first")
-    config = TrainConfig(**{**SMALL, "steps": 1}, learning_rate=1e-12)
-    second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)
+def test_a_run_can_start_from_weights(shared_sequence: Path, finished: Path, tmp_path: Path) -> None:
+    """Without a width, the result is of that of the weights, and says so, so that it can be loaded."""
+    first = finished / f"{DEFAULT}.safetensors"
+    config = TrainConfig(**{**SMALL, "steps": 1, "width": 0}, learning_rate=1e-12)
+    second = train(config, [shared_sequence], tmp_path / "run", cache=finished / "cache", initial_weights=first)
     before, after = (load_weights(path).state_dict() for path in (first, second))
     for key, tensor in before.items():
         torch.testing.assert_close(after[key], tensor, rtol=1e-3, atol=1e-6)
-    assert describe_weights(second)["initial_weights"] == describe_weights(first)["sha256"]
-    message = refused(lambda: train(config, [small_sequence], tmp_path / "second"))
-    assert "data.json" in message
-
-
-def test_weights_of_another_width_are_gone_on_with(small_sequence: Path, tmp_path: Path) -> None:
-    """The run does not state a width; its result must, so that it can be loaded."""
-    first = train(TrainConfig(**{**SMALL, "steps": 1}), [small_sequence], tmp_path / "first")
-    config = TrainConfig(**{**SMALL, "steps": 1, "width": 0})
-    second = train(config, [small_sequence], tmp_path / "second", initial_weights=first)
-    assert describe_weights(second)["settings"] == create_settings(width=SMALL["width"])
-    load_weights(second, DEFAULT)
+    about = describe_weights(second)
+    assert about["initial_weights"] == describe_weights(first)["sha256"]
+    assert about["settings"] == create_settings(width=SMALL["width"])
+    assert "data.json" in refused(lambda: train(config, [shared_sequence], tmp_path / "run", cache=finished / "cache"))
