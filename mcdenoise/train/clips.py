@@ -118,10 +118,10 @@ class ClipSampler:
     The position, the frames, the noise seed, flips, 90-degree rotations and the options below are random. Each clip
     depends only on its own seed: a batch can be drawn in any order, at any time, by any number of processes.
 
-    Flips and rotations are the same for all buffers and frames of a clip. Motion vectors are transformed with the image,
-    and the camera's matrix projects to the transformed crop. World-space normals and positions are not transformed: a
-    flipped or rotated image shows a flipped or rotated world with other names of axes. For the same reason, axes are
-    also permuted and reversed at random. Color channels are permuted in the same way in radiance and albedo.
+    Flips and rotations are the same for all buffers and frames of a clip. Motion is transformed with the image, and the
+    camera's matrix projects to the transformed crop. World-space normals and positions are not transformed: a flipped
+    or rotated image shows a flipped or rotated world with other names of axes. For the same reason, axes are also
+    permuted and reversed at random. Color channels are permuted in the same way in radiance and albedo.
 
     Light is linear: scaling all lamps of a scene, also per channel, scales noisy color and reference by the same
     factor. Networks normalize the exposure, so this changes only the loss, whose epsilon is in units of radiance.
