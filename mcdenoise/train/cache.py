@@ -23,7 +23,6 @@ from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mcdenoise.data.sequences import Sequence
@@ -32,6 +31,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models.accumulated import motion_to_previous
 from mcdenoise.train.front import ACCUMULATED, Front
+from mcdenoise.train.shots import Array, Shot
 
 _CAMERA = frozenset({"position", "view_projection"})
 # Patterns of the files of a sequence, relative to its folder.
@@ -39,13 +39,12 @@ _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "noise_seed*/*", "inputs/*", "inputs/noise_seed*/*")
 _FORMAT = 5
 
-Array: TypeAlias = NDArray[Any]
 # Index of the first frame, and noise seed: each pair has its own colors.
 _Start: TypeAlias = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class CachedShot:
+class CachedShot(Shot):
     """Consecutive frames as the network's input, for one or more noise seeds.
 
     Args:
@@ -88,49 +87,17 @@ class CachedShot:
         noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
         return CachedShot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
 
-    def read(
-        self,
-        frames: slice = slice(None),
-        rows: slice = slice(None),
-        columns: slice = slice(None),
-        *,
-        noise_seed: int = 0,
-        channels: Mapping[str, list[int]] = {},
-        turn: Callable[[Array], Array] = lambda image: image,
-    ) -> dict[str, Tensor]:
-        """Copy a part of the shot from disk: ``(T, C, H, W)`` float32 by name.
-
-        Args:
-            frames: range of frames.
-            rows: range of rows.
-            columns: range of columns.
-            noise_seed: index of the noise seed.
-            channels: for some buffers, the selection and order of channels.
-            turn: returns another view of ``(T, C, H, W)``, flipped or rotated.
-        """
-        color = self.colors[noise_seed]
-        sources: dict[str, Array] = {}
-        start = 0
+    def views(self, frames: slice, rows: slice, columns: slice, noise_seed: int) -> dict[str, Array]:
+        """See :meth:`mcdenoise.train.shots.Shot.views`."""
+        color, found, start = self.colors[noise_seed], dict[str, Array](), 0
         for name, count in self.parts.items():
             if start < color.shape[1]:
-                sources[name] = color[:, start : start + count]
+                found[name] = color[:, start : start + count]
             start += count
-        parts = {}
-        own = self.noisy[noise_seed] if self.noisy else {}
-        for name, source in {**sources, **self.features, **own}.items():
-            if source.ndim == 3:
-                parts[name] = torch.from_numpy(source[frames].astype(np.float32))
-                continue
-            # Views only: the pixels are moved once, when they are copied.
-            parts[name] = copied(turn(source[frames, :, rows, columns]), channels.get(name))
-        return parts
-
-
-def copied(image: Array, order: list[int] | None) -> Tensor:
-    """Copy channels of ``(T, C, H, W)`` in this order, by default all, as float32."""
-    channels = range(image.shape[1]) if order is None else order
-    part = np.empty((image.shape[0], len(channels), *image.shape[2:]), np.float32)
-    return torch.from_numpy(np.stack([image[:, i] for i in channels], 1, out=part))
+        found |= {**self.features, **(self.noisy[noise_seed] if self.noisy else {})}
+        return {
+            name: array[frames] if array.ndim == 3 else array[frames, :, rows, columns] for name, array in found.items()
+        }
 
 
 @dataclass(frozen=True)

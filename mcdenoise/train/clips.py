@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,9 +16,8 @@ from mcdenoise.frame import RADIANCE, Frame, Hints
 from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
-from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import NO_ALBEDO, demodulate
-from mcdenoise.train.cache import Array
+from mcdenoise.train.shots import Array, Shot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
@@ -42,7 +41,7 @@ class Clip:
 
     @staticmethod
     def of(shot: dict[str, Tensor]) -> Clip:
-        """A clip with a batch of one from the result of :meth:`mcdenoise.train.cache.CachedShot.read`."""
+        """A clip with a batch of one from the result of :meth:`mcdenoise.train.shots.Shot.read`."""
         return Clip({name: buffer[None] for name, buffer in shot.items()})
 
     def __getitem__(self, name: str) -> Tensor:
@@ -75,43 +74,6 @@ class Clip:
         return Frame(**flat, extra=extra, hints=Hints(keep_all=True))
 
 
-class Shot(Protocol):
-    """Consecutive frames to cut clips from: :class:`mcdenoise.train.cache.CachedShot`, or a packed take."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-
-    @property
-    def noise_seeds(self) -> int:
-        """Number of noisy colors of a frame."""
-
-    @property
-    def references(self) -> int:
-        """Number of the last frames that have a reference."""
-
-    @property
-    def demodulated(self) -> bool:
-        """Whether the radiance of the color is demodulated."""
-
-    def __len__(self) -> int: ...
-
-    def cut(self, frames: slice) -> Shot:
-        """Select consecutive frames."""
-
-    def read(
-        self,
-        frames: slice = slice(None),
-        rows: slice = slice(None),
-        columns: slice = slice(None),
-        *,
-        noise_seed: int = 0,
-        channels: Mapping[str, list[int]] = {},
-        turn: Callable[[Array], Array] = lambda image: image,
-    ) -> dict[str, Tensor]:
-        """Copy a part: ``(T, C, H, W)`` float32 by name; the reference only of frames that have one."""
-
-
 class ClipSampler:
     """Draws random clips from shots, with augmentations that are physically exact.
 
@@ -142,10 +104,6 @@ class ClipSampler:
         gloss: probability that surfaces without albedo (mirrors, glass, black gloss, and lamps) are darkened by up to
             six stops: most of these are emitters, and without this a network would learn to treat a black screen as
             one.
-        less_noise: probability that the noise of a clip, ``color - reference``, is scaled by a factor between 1/32 and
-            1, whose logarithm is uniform: as if up to 1024 times as many samples had been taken. Clips with correlated
-            noise are left alone, because their references have it, too. Only for shots without other images that were
-            computed from the noisy ones.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -162,12 +120,10 @@ class ClipSampler:
         exposure: float = 0.0,
         tint: float = 0.0,
         gloss: float = 0.0,
-        less_noise: float = 0.0,
     ) -> None:
         self.shots = [shot for shot in shots if len(shot) >= frames]
         self.frames, self.crop = frames, crop
         self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
-        self.less_noise = less_noise
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
 
@@ -207,11 +163,6 @@ class ClipSampler:
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
-        if self.less_noise and float(torch.rand(())) < self.less_noise and not _noise_is_spread(clip):
-            scale = 32 ** -torch.rand(())
-            clip["color"] = torch.lerp(clip["reference"], clip["color"], scale)
-            if "variance" in clip:
-                clip["variance"] *= scale.square()
         stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
         factor = torch.exp2(stops).reshape(3, 1, 1)
         if self.key:
@@ -243,10 +194,6 @@ class ClipSampler:
         painted |= dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))
         for name in painted.keys() & clip.keys():
             clip[name][..., top : top + height, left : left + width] = painted[name]
-
-
-def _noise_is_spread(clip: dict[str, Tensor]) -> bool:
-    return noise_is_spread(clip["color"], clip.get("albedo"), clip.get("normal"))
 
 
 def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:

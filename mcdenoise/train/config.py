@@ -61,8 +61,6 @@ class TrainConfig:
         exposure: the light of a clip is scaled by up to this many stops.
         tint: each color channel of the light is scaled by up to this many stops.
         gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
-        less_noise: probability that the noise of a clip is reduced, unless it is correlated, as if up to 1024 times as
-            many samples had been taken; only for models that neither accumulate nor demodulate the color.
         exact_features: train and validate on sequences with exact features only, see
             :func:`mcdenoise.sampling.has_exact_features`; the others are skipped.
         precision: bfloat16 runs convolutions in bfloat16.
@@ -94,7 +92,6 @@ class TrainConfig:
     exposure: float = 0.0
     tint: float = 0.0
     gloss: float = 0.0
-    less_noise: float = 0.0
     exact_features: bool = False
     precision: FloatPrecision = "float32"
     seed: int = 0
@@ -168,7 +165,7 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
         raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
     if not 0 <= config.ema < 1:
         raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    for name in ("lamps", "gloss", "less_noise"):
+    for name in ("lamps", "gloss"):
         if not 0 <= settings[name] <= 1:
             raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
     _ = config.model_settings, config.loss_weights

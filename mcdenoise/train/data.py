@@ -14,10 +14,11 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
 from mcdenoise.sampling import has_exact_features
 from mcdenoise.train.cache import features_of, open_cached
-from mcdenoise.train.clips import ClipSampler, Shot, check_sizes
+from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
 from mcdenoise.train.packed import check_packed, describe_packed, features_of_shard, open_packed, whole
+from mcdenoise.train.shots import Shot
 
 # Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
 _FEATURES = ("albedo", "normal", "depth")
@@ -76,8 +77,7 @@ class DataFolders:
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
                 frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, or
-                ``less_noise`` is set for a model that is given images computed from the color, or none has exact
-                features although they are required.
+                none has exact features although they are required.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
@@ -96,11 +96,6 @@ class DataFolders:
         takes = [*packed[0], *packed[1]]
         common = frozenset.intersection(*map(features_of, both), *map(features_of_shard, takes))
         front = front.of((needs.buffers | needs.uses) & common)
-        if config.less_noise and (front.demodulates or front.parts.keys() != {"color"}):
-            raise InputError(
-                "less_noise: expected a model that is given the color of single frames as it is, found one that is "
-                "given images computed from it; set it to 0"
-            )
         used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
         # The cache does not store single samples: methods that take samples are trained on their mean.
         used -= {"samples"}
@@ -108,8 +103,6 @@ class DataFolders:
         for sequence in both:
             _check_trainable(sequence, wanted)
         check_packed(takes, wanted)
-        if takes and config.less_noise:
-            raise InputError("less_noise: expected sequences with a reference for every frame, found packed takes")
         features = used & common
         folders = DataFolders(config, front, features, opened[0], opened[1], packed[0], packed[1])
         lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
@@ -166,7 +159,6 @@ class DataFolders:
             exposure=config.exposure,
             tint=config.tint,
             gloss=config.gloss,
-            less_noise=config.less_noise,
         )
         return TrainingData(sampler, watched, description)
 

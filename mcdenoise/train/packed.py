@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mcdenoise.data.shards import ERROR, Shard, find_shards, open_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.train.cache import Array, copied
 from mcdenoise.train.front import Front
+from mcdenoise.train.shots import Array, Shot
 
 
 @dataclass(frozen=True)
-class PackedShot:
+class PackedShot(Shot):
     """Consecutive frames of a packed take.
 
     Args:
@@ -37,7 +36,11 @@ class PackedShot:
     buffers: frozenset[str]
     first: int
     last: int
-    noise_seeds: int = 1
+
+    @property
+    def noise_seeds(self) -> int:
+        """Number of noisy colors of a frame."""
+        return 1
 
     @property
     def demodulated(self) -> bool:
@@ -67,44 +70,32 @@ class PackedShot:
         first, last, _ = frames.indices(len(self))
         return replace(self, first=self.first + first, last=self.first + max(first, last))
 
-    def read(
-        self,
-        frames: slice = slice(None),
-        rows: slice = slice(None),
-        columns: slice = slice(None),
-        *,
-        noise_seed: int = 0,
-        channels: Mapping[str, list[int]] = {},
-        turn: Callable[[Array], Array] = lambda image: image,
-    ) -> dict[str, Tensor]:
-        """See :meth:`mcdenoise.train.cache.CachedShot.read`.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+    def views(self, frames: slice, rows: slice, columns: slice, noise_seed: int) -> dict[str, Array]:
+        """See :meth:`mcdenoise.train.shots.Shot.views`."""
         chosen = self.cut(frames)
-        arrays = self.shard.read(None if self.front.wrappers else {"color", "reference", *self.buffers})
-        arrays.pop(ERROR, None)
-        images = {}
-        for name, array in arrays.items():
+        arrays: dict[str, Array] = {}
+        needed = None if self.front.wrappers else {"color", "reference", *self.buffers}
+        for name, array in self.shard.read(needed).items():
             start = self._referenced if name == "reference" else 0
-            part = array[max(chosen.first - start, 0) : max(chosen.last - start, 0), :, rows, columns]
-            images[name] = torch.from_numpy(part.astype(np.float32))
-        if not chosen.references:
-            images.pop("reference", None)
+            arrays[name] = array[max(chosen.first - start, 0) : max(chosen.last - start, 0), :, rows, columns]
         if self.front.wrappers:
-            images |= self._processed(images)
-        kept = {*self.front.parts, "reference", *self.buffers} & images.keys()
-        return {name: copied(turn(images[name].numpy()), channels.get(name)) for name in kept}
+            arrays |= self._processed(arrays)
+        kept = {*self.front.parts, *self.buffers} | ({"reference"} if chosen.references else set())
+        return {name: array for name, array in arrays.items() if name in kept}
 
-    def _processed(self, images: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def _processed(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """What the front makes of each frame."""
+        images: dict[str, Any] = {
+            name: torch.from_numpy(array.astype(np.float32))
+            for name, array in arrays.items()
+            if name not in ("reference", ERROR)
+        }
         step, found = self.front.begin(), []
-        for t in range(len(images["color"])):
-            buffers: dict[str, Any] = {name: image[t : t + 1] for name, image in images.items() if name != "reference"}
-            seen = dict(step(Frame(**buffers).validate()[0]).items())
-            found.append({name: seen[name] for name in self.front.parts})
-        return {name: torch.cat([each[name] for each in found]) for name in self.front.parts}
+        for t in range(len(arrays["color"])):
+            frame = Frame(**{name: image[t : t + 1] for name, image in images.items()})
+            seen = dict(step(frame.validate()[0]).items())
+            found.append({name: seen[name].numpy() for name in self.front.parts})
+        return {name: np.concatenate([each[name] for each in found]) for name in self.front.parts}
 
 
 def open_packed(paths: Iterable[Path]) -> list[Shard]:

@@ -11,8 +11,9 @@ from torch import Tensor
 from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import Model, State
 from mcdenoise.ops import remodulate
-from mcdenoise.train.clips import Clip, Shot
+from mcdenoise.train.clips import Clip
 from mcdenoise.train.losses import RESULT
+from mcdenoise.train.shots import Shot
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

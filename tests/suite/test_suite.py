@@ -356,7 +356,7 @@ def test_the_command_scores_the_existing_rows(
     out = tmp_path / "out"
     status, said, message = run(
         *("--suite", "wild", "--data", tmp_path / "data", "--no-render", "-o", out, "--threads", 1),
-        *("--models", "cascaded_v2_micro", "--json", tmp_path / "suite.json"),
+        *("--models", "cascaded_v2_micro,oidn(quality=fast)", "--json", tmp_path / "suite.json"),
     )
     assert status == 0, message
     assert "## cascaded_v2_micro" in said

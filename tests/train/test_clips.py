@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from mcdenoise.errors import InputError
 from mcdenoise.ops import motion_from_position, remodulate
@@ -182,39 +181,6 @@ def test_lamps_shine_alike_in_color_and_reference() -> None:
     dark = ClipSampler([shot_of(stack)], frames=4, crop=16).draw(seeds)
     assert torch.equal(clip["current"], clip["color"])
     assert dark["reference"].unique().tolist() == [0.5]
-
-
-def test_noise_is_scaled_by_a_factor_of_the_whole_clip() -> None:
-    g = torch.Generator().manual_seed(0)
-    buffers = {name: torch.rand(4, 3, 6, 6, generator=g) for name in ("color", "reference")}
-    features = {"reference": buffers["reference"].numpy(), "variance": torch.ones(4, 3, 6, 6).numpy()}
-    shot = CachedShot((buffers["color"].numpy(),), features, parts={"color": 3})
-    seeds = list(range(400))
-    plain = ClipSampler([shot], 2, 6).draw(seeds)
-    always = ClipSampler([shot], 2, 6, less_noise=1.0).draw(seeds)
-    assert torch.equal(plain["reference"], always["reference"])
-    noise, less = plain["color"] - plain["reference"], always["color"] - always["reference"]
-    factors = (noise * less).flatten(1).sum(1) / noise.square().flatten(1).sum(1)
-    torch.testing.assert_close(less, noise * factors.reshape(-1, 1, 1, 1, 1), rtol=0, atol=1e-6)
-    torch.testing.assert_close(always["variance"][:, 0, 0, 0, 0], factors.square(), rtol=1e-4, atol=0)
-    # The logarithm to the base 32 is uniform between -1 and 0: mean -0.5, standard deviation of the mean 0.29 / 20.
-    logarithms = factors.log() / torch.tensor(32.0).log()
-    assert -1 - 1e-5 <= logarithms.min() < -0.95
-    assert -0.05 < logarithms.max() <= 1e-5
-    assert abs(logarithms.mean() + 0.5) < 4 * 0.29 / 20
-    sometimes = ClipSampler([shot], 2, 6, less_noise=0.25).draw(seeds)
-    changed = ~torch.isclose(sometimes["color"], plain["color"]).flatten(1).all(1)
-    assert abs(changed.float().mean() - 0.25) < 4 * (0.25 * 0.75 / 400) ** 0.5
-
-
-def test_correlated_noise_is_not_scaled() -> None:
-    g = torch.Generator().manual_seed(0)
-    noise = torch.rand(4, 3, 64, 64, generator=g)
-    constant = {name: torch.full((4, 3, 64, 64), 0.5).numpy() for name in ("reference", "albedo", "normal")}
-    for color, scaled in ((noise, True), (avg_pool2d(noise, 3, 1, 1), False)):
-        shot = CachedShot(((0.5 + color).numpy(),), constant, parts={"color": 3})
-        plain, less = (ClipSampler([shot], 2, 48, less_noise=p).draw(list(range(4))) for p in (0.0, 1.0))
-        assert torch.equal(plain["color"], less["color"]) is not scaled
 
 
 def test_shots_are_drawn_in_proportion_to_their_frames() -> None:

@@ -642,8 +642,6 @@ def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: P
         ("exposure", -1.0, "exposure: expected 0 to 14 stops, found -1.0"),
         ("tint", float("nan"), "tint: expected 0 to 14 stops, found nan"),
         ("gloss", 1.5, "gloss: expected in [0, 1], found 1.5"),
-        ("less_noise", -0.5, "less_noise: expected in [0, 1], found -0.5"),
-        ("less_noise", 0.5, "less_noise: expected a model that is given the color of single frames as it is"),
     ],
 )
 def test_settings_that_cannot_be_leave_no_run(
