@@ -359,19 +359,19 @@ def _checksum(path: Path) -> str:
 
 
 def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
-    """Map the arrays; return ``None`` if they are missing, belong to another sequence, or are damaged."""
-    sequence = plan.sequence
+    """Map the arrays; return ``None`` if they are missing or damaged, as their checksums tell."""
     try:
         about = json.loads((folder / "about.json").read_text())
         if any(_checksum(folder / name) != checksum for name, checksum in about["files"].items()):
             return None
-        features = _map_features(folder, plan.shared, None, sequence)
-        noisy = [_map_features(folder, plan.own, k, sequence) for k in range(plan.noise_seeds)] if plan.own else []
+        features = {name: _map(folder / _feature_name(name)) for name in plan.shared}
+        noisy = [
+            {name: _map(folder / _feature_name(name, k)) for name in plan.own}
+            for k in range(plan.noise_seeds if plan.own else 0)
+        ]
         shots = []
         for first in plan.firsts:
             colors = [_map(folder / _color_name((first, k))) for k in range(plan.noise_seeds)]
-            for color in colors:
-                _check(f"color of {first}", color, plan.color_shape(first))
             later = {name: feature[first:] for name, feature in features.items()}
             own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
             shots.append(CachedShot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
@@ -380,23 +380,7 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
         return None
 
 
-def _map_features(folder: Path, names: tuple[str, ...], noise_seed: int | None, sequence: Sequence) -> dict[str, Array]:
-    features = {name: _map(folder / _feature_name(name, noise_seed)) for name in names}
-    for name, feature in features.items():
-        _check(name, feature, (len(sequence), *feature.shape[1:-2], *_size(name, sequence)))
-    return features
-
-
-def _size(name: str, sequence: Sequence) -> tuple[int, int]:
-    return (4, 4) if name == "view_projection" else sequence.size
-
-
 def _map(path: Path) -> Array:
     # A plain view, because slicing a memmap takes longer than reading.
     array: Array = np.load(path, mmap_mode="r", allow_pickle=False).view(np.ndarray)
     return array
-
-
-def _check(name: str, array: Array, shape: tuple[int, ...]) -> None:
-    if array.shape != shape or array.dtype not in (np.float16, np.float32):
-        raise ValueError(f"{name}: expected {shape}, found {array.shape} {array.dtype}")
