@@ -68,10 +68,6 @@ def test_frames_are_found_by_their_number(tmp_path: Path, names: tuple[str, ...]
     assert list(found) == [8, 9, 10]
 
 
-def test_a_single_frame_is_found(tmp_path: Path) -> None:
-    assert find_images(touched(tmp_path / "out", "frame.0012.exr"), [12])[12].name == "frame.0012.exr"
-
-
 @pytest.mark.parametrize(
     ("names", "message"),
     [
@@ -258,14 +254,6 @@ def test_without_flip_the_rest_is_there(small_sequence: Path, images: Path, monk
     assert {"SMAPE", "PSNR", "SSIM"} <= set(table.mean)
 
 
-def test_alpha_is_ignored(small_sequence: Path, images: Path) -> None:
-    plain = evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean
-    for path in images.iterdir():
-        pixels, _, _ = read_exr(path)
-        write_exr(path, np.concatenate([pixels, np.zeros_like(pixels[..., :1])], -1), [*RGB, "A"], full_float=True)
-    assert evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean == pytest.approx(plain)
-
-
 def test_primaries_of_the_images_are_converted(small_sequence: Path, images: Path, colour: Any) -> None:
     """References converted to ACEScg score like the references themselves."""
     spaces = colour.RGB_COLOURSPACES
@@ -343,18 +331,6 @@ def test_images_of_another_kind(
     write_exr(images / "denoised3.exr", np.zeros(shape), channels)
     with pytest.raises(InputError, match=rf"denoised3.exr: .*{message}"):
         evaluate_folder(open_sequence(small_sequence), images)
-
-
-@pytest.mark.parametrize("noisy", [False, True])
-def test_images_among_other_layers(small_sequence: Path, images: Path, noisy: bool) -> None:
-    """A denoised image among other layers is compared as if it were alone; the noisy image beside it is ignored."""
-    alone = evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean
-    layers = ["Combined", "Depth", *(["Noisy Image"] if noisy else [])]
-    for path in images.glob("denoised*.exr"):
-        pixels = read_exr(path)[0]
-        others = [np.full_like(pixels, 7.0) for _ in layers[1:]]
-        write_exr(path, np.concatenate([pixels, *others], -1), [f"View.{layer}.{c}" for layer in layers for c in RGB])
-    assert evaluate_folder(open_sequence(small_sequence), images).tables["strict"].mean == alone
 
 
 def test_a_damaged_image(small_sequence: Path, images: Path) -> None:

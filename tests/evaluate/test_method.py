@@ -73,18 +73,6 @@ def test_a_method_sees_frames_without_a_reference_too(small_sequence: Path) -> N
     assert result.tables["strict"].counts["SMAPE"] == 3
 
 
-def test_frames_that_are_not_successive_are_no_pair(small_sequence: Path) -> None:
-    result = evaluate_method(open_sequence(small_sequence, "0,2-3"), Denoiser(same), "nothing")
-    assert (result.tables["strict"].counts["SMAPE"], result.tables["strict"].counts["tRMSE"]) == (3, 1)
-
-
-def test_a_sequence_without_references_is_rejected(small_sequence: Path) -> None:
-    for path in (small_sequence / "inputs").glob("reference*.exr"):
-        path.unlink()
-    with pytest.raises(InputError, match="expected references"):
-        evaluate_method(open_sequence(small_sequence), Denoiser(same), "nothing")
-
-
 def test_a_bad_frame_is_named(small_sequence: Path) -> None:
     path = small_sequence / "inputs" / "albedo1.exr"
     pixels: Any = read_exr(path)[0]

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from kornia.metrics import psnr
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -74,13 +73,6 @@ def test_psnr_written_out() -> None:
     assert psnr_srgb(image(5.0), image(1.0)).item() == math.inf
 
 
-def test_psnr_is_that_of_kornia() -> None:
-    torch.manual_seed(0)
-    first, second = torch.rand(1, 3, 9, 7) * 1.5, torch.rand(1, 3, 9, 7) * 1.5
-    expected = psnr(displayed(first), displayed(second), 1.0)
-    torch.testing.assert_close(psnr_srgb(first, second)[0], expected)
-
-
 def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
     """A noisy image with highlights and its smooth reference, ``(1, 3, H, W)``."""
     torch.manual_seed(0)
@@ -134,13 +126,6 @@ def test_flip_is_that_of_its_authors() -> None:
     errors = flip.evaluate(truth, test, "LDR", applyMagma=False)[0]
     assert 0.05 < errors.mean() < 0.9
     assert flip_srgb(image, reference).item() == pytest.approx(float(errors.mean()), rel=1e-4)
-
-
-def test_flip_of_flat_images_written_out() -> None:
-    # Black and white have the maximum color distance, up to the compression of large distances.
-    black, white = torch.zeros(1, 3, 16, 16), torch.ones(1, 3, 16, 16)
-    assert flip_srgb(black, white).item() > 0.9
-    assert flip_srgb(9 * white, white).item() == 0
 
 
 def test_hdr_flip_is_that_of_its_authors() -> None:
@@ -211,11 +196,6 @@ def test_temporal_metrics_batch_and_have_a_gradient() -> None:
     assert gradcheck(lambda x: temporal_rmse_srgb(x, references), (clips.requires_grad_(),))
 
 
-def test_displayed_values_are_clamped_and_on_the_srgb_curve() -> None:
-    shown = displayed(image(-1.0, 0.0, 0.5, 1.0, 9.0))[0, 0, 0]
-    torch.testing.assert_close(shown, torch.tensor([0.0, 0.0, 1.055 * 0.5 ** (1 / 2.4) - 0.055, 1.0, 1.0]))
-
-
 def test_displayed_values_agree_with_colour_science(colour: Any) -> None:
     values = torch.linspace(0, 1, 1001, dtype=torch.float64).expand(3, 1, 1001)
     expected = colour.cctf_encoding(values[0, 0].numpy(), "sRGB")
@@ -240,7 +220,7 @@ def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
     assert metric(images, images).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bool, torch.int64, torch.complex64], ids=str)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.complex64], ids=str)
 @pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
 def test_integers_and_complex_numbers_are_rejected(
     metric: Callable[[Tensor, Tensor], Tensor], dtype: torch.dtype
