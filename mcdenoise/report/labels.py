@@ -45,8 +45,9 @@ def _beside(point: tuple[float, float], size: tuple[float, float], distance: flo
     # To the left corner: the gap, and as much of the label as lies between its centre and that side.
     left = point[0] + across * distance * height + width / 2 * (max(-1.0, min(1.0, 1.5 * across)) - 1)
     bottom = point[1] + up * (distance * height + height / 2) - height / 2
-    left = max(min(left, bounds[2] - width), bounds[0])
-    bottom = max(min(bottom, bounds[3] - height), bounds[1])
+    # The right and upper bounds are those of the figure, which cuts off what lies beyond.
+    left = min(max(left, bounds[0]), bounds[2] - width)
+    bottom = min(max(bottom, bounds[1]), bounds[3] - height)
     return left, bottom, left + width, bottom + height
 
 

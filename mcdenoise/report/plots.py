@@ -36,7 +36,7 @@ _VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
 _MARKERS = {"trainable": "o", "fixed": "s", "baseline": "D"}
 _SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
 # Room for the names beside the last points of the cost plot, as a fraction of the axis.
-_ROOM = {"wide": 0.3, "narrow": 0.04}
+_ROOM = {"wide": 0.5, "narrow": 0.04}
 # Room for the labels of the vertical ticks, in points.
 _TICK_ROOM = 46.0
 # A label farther than this from its point, in points, is tied to it by a line.

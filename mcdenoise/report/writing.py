@@ -316,7 +316,8 @@ def _verdict(view: View, names: list[str]) -> str:
         text = f"{ours.method.name} has {abs(change):.0%} {'less' if change < 0 else 'more'} error ({names[0]}) than "
         text += rival.method.name
     if ours.milliseconds and rival.milliseconds and rival.milliseconds.value > 0:
-        text += f", in {ours.milliseconds.value / rival.milliseconds.value:.2g} times its time"
+        ratio = ours.milliseconds.value / rival.milliseconds.value
+        text += ", in the same time" if 0.95 < ratio < 1.05 else f", in {ratio:.2g} times its time"
     return f"{text}."
 
 
