@@ -436,9 +436,10 @@ def _faults(results: Results) -> Iterator[str]:
             stage, skipped = row.get("stage"), row.get("skipped")
             if not (isinstance(stage, str) and isinstance(skipped, int | float) and 0 <= skipped <= 1):
                 yield f"the plan {reprlib.repr(row)}"
-    for name in (one.method for one in (*results.cells, *results.costs, *results.fits)):
-        if name not in methods:
-            yield f"measurements of {reprlib.repr(name)}, which is no method"
+    measured: list[Cell | Cost | Fit] = [*results.cells, *results.costs, *results.fits]
+    for one in measured:
+        if one.method not in methods:
+            yield f"measurements of {reprlib.repr(one.method)}, which is no method"
     cells = ((cell.whole, cell.computing, *cell.stages.values()) for cell in results.cells)
     for times in (*cells, (cost.milliseconds for cost in results.costs)):
         for time in times:
