@@ -130,11 +130,8 @@ def load_camera_path(path: Path) -> CameraPath:
         raise InputError(f"{path}: {where} is unusable: {missing}") from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera, found none")
-    objects = content.get("objects", {})
-    if not isinstance(objects, dict):
-        raise InputError(f"{path}: expected 'objects' to map ids to lists of matrices, found {type(objects).__name__}")
     try:
-        return CameraPath(cameras, check_moves(objects, len(cameras)))
+        return CameraPath(cameras, check_moves(content.get("objects", {}), len(cameras)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -149,6 +146,8 @@ def check_moves(moves: Mapping[str, Any], frames: int) -> dict[str, Array]:
     Raises:
         InputError: a matrix is missing, not finite, not affine or cannot be inverted.
     """
+    if not isinstance(moves, Mapping):
+        raise InputError(f"expected 'objects' to map ids to lists of matrices, found {type(moves).__name__}")
     checked: dict[str, Array] = {}
     for identity, matrices in moves.items():
         try:

@@ -17,7 +17,7 @@ from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import FORMATS, Window
 from mcdenoise.data.readers.bmfr import find_bmfr, open_bmfr
 from mcdenoise.data.readers.choice import parse_mapping
-from mcdenoise.data.readers.names import find_files, group_files
+from mcdenoise.data.readers.names import FileGroup, find_files, group_files
 from mcdenoise.data.readers.noisebase import find_zips, open_noisebase
 from mcdenoise.data.readers.opening import ColorSpace, open_files
 from mcdenoise.data.readers.source import Source
@@ -259,14 +259,14 @@ def open_sequence(
     given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
     if not given:
         raise InputError("input: expected a folder, a file or a pattern, found nothing")
-    where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
-    bmfr = find_bmfr(given)
     gaps: list[str] = []
 
     def chosen(present: list[int]) -> list[int]:
         gaps.extend(_gaps(present) if frames is None else [])
         return _choose(given[0], present, frames)
 
+    where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
+    bmfr = find_bmfr(given)
     source: Source
     if bmfr is not None and not mapping and not lights:
         source, layout = open_bmfr(*bmfr, chosen, color_has_albedo), "bmfr"
@@ -275,23 +275,9 @@ def open_sequence(
             raise InputError(f"{where}: expected neither --map nor --layers, found one: these arrays have their names")
         source, layout = open_noisebase(zips, chosen, where=where), "noisebase"
     else:
-        paths = find_files(given if bmfr is None else [bmfr[0]])
-        if not paths:
-            others = ", ".join(sorted({each.suffix for each in given[0].glob("*.*")})[:8]) if given[0].is_dir() else ""
-            raise InputError(
-                f"{where}: expected images that a renderer wrote ({', '.join(FORMATS)}), found "
-                f"{f'only {others}' if others else 'none'}; check the path"
-            )
-        groups, layout = group_files(paths)
-        source = open_files(
-            groups,
-            chosen,
-            where=where,
-            mapping=parse_mapping(mapping),
-            color_has_albedo=color_has_albedo,
-            lights=lights,
-            color_space=color_space,
-        )
+        groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
+        named = parse_mapping(mapping)
+        source = open_files(groups, chosen, where, named, color_has_albedo, lights, color_space)
     place = given[0].resolve()
     alike = ("numbers", "size", "buffers", "reference_numbers", "color_has_albedo", "noise_seeds", "noisy", "table")
     return Sequence(
@@ -305,6 +291,17 @@ def open_sequence(
         _source=source,
         **{name: getattr(source, name) for name in alike},
     )
+
+
+def _groups(given: Sequential[Path], where: str) -> tuple[list[FileGroup], str]:
+    paths = find_files(given)
+    if not paths:
+        others = ", ".join(sorted({each.suffix for each in given[0].glob("*.*")})[:8]) if given[0].is_dir() else ""
+        raise InputError(
+            f"{where}: expected images that a renderer wrote ({', '.join(FORMATS)}), found "
+            f"{f'only {others}' if others else 'none'}; check the path"
+        )
+    return group_files(paths)
 
 
 def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> list[int]:

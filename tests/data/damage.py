@@ -102,7 +102,7 @@ def outcomes(folder: Path, files: Mapping[str, bytes], written: Path | None = No
     Args:
         folder: for the files.
         files: contents by name.
-        written: where each is written after it was read as a shot; else it is read as a buffer of the BMFR layout.
+        written: where each is written after it was read as a shot; else it is read as matrices.
     """
     folder.mkdir()
     for name, content in files.items():

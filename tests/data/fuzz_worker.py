@@ -1,6 +1,6 @@
 """Reads each file of a folder in a process of its own, with little memory: one line of JSON for each on stdout.
 
-With a second folder, each is opened as the shot of a renderer, and its frame is written there.
+They are matrices; or with a second folder, each is opened as the shot of a renderer, and its frame is written there.
 """
 
 import json
@@ -15,7 +15,6 @@ import numpy as np
 import OpenEXR  # noqa: F401
 
 from mcdenoise.data.camera_matrices import read_camera_matrices
-from mcdenoise.data.exr import read_exr
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
@@ -27,15 +26,6 @@ MEMORY = 512 * 2**20
 def taken() -> int:
     """Bytes of address space that this process has."""
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-
-
-def read_alone(path: Path) -> None:
-    """Read the file as a buffer of the BMFR layout, or its matrices."""
-    if path.suffix == ".h":
-        read_camera_matrices(path)
-    else:
-        read_image_header(path)
-        read_exr(path)
 
 
 def read_and_write(path: Path, out: Path) -> None:
@@ -68,7 +58,7 @@ def main(folder: Path, out: Path | None) -> None:
         print(json.dumps({"begun": path.name}), flush=True)
         try:
             if out is None:
-                read_alone(path)
+                read_camera_matrices(path)
             else:
                 read_and_write(path, out / path.name)
             outcome = ""

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -29,15 +28,6 @@ def one_line(error: pytest.ExceptionInfo[InputError]) -> str:
     return message
 
 
-def test_round_trip_float(tmp_path: Path, image: np.ndarray) -> None:
-    write_exr(tmp_path / "a.exr", image, RGB, full_float=True)
-    pixels, channels, _ = read_exr(tmp_path / "a.exr")
-    assert pixels.dtype == np.float32
-    assert channels == RGB
-    np.testing.assert_array_equal(pixels, image)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
-
-
 def test_round_trip_half_and_zip(tmp_path: Path, image: np.ndarray) -> None:
     write_exr(tmp_path / "a.exr", image, RGB)
     np.testing.assert_array_equal(read_exr(tmp_path / "a.exr")[0], image.astype(np.float16).astype(np.float32))
@@ -49,6 +39,9 @@ def test_round_trip_half_and_zip(tmp_path: Path, image: np.ndarray) -> None:
 @pytest.mark.parametrize("channels", [["Y"], ["X", "Y"], ["R", "G", "B", "A"], [f"c{i}" for i in range(9)]])
 def test_any_number_of_channels(tmp_path: Path, channels: list[str]) -> None:
     image = np.arange(6 * len(channels), dtype=np.float32).reshape(2, 3, -1)
+    for missing in ("missing.exr", "long" * 100 + ".exr", "."):
+        with pytest.raises(InputError, match=r"found no such file|found a folder"):
+            read_exr(tmp_path / missing)
     write_exr(tmp_path / "a.exr", image, channels)
     pixels, names, _ = read_exr(tmp_path / "a.exr")
     assert names == channels
@@ -97,87 +90,11 @@ def test_truncated_file_is_refused_wherever_it_is_cut(tmp_path: Path, image: np.
     else:
         write_exr(whole, image, RGB)
     content = whole.read_bytes()
-    for length in [*range(0, len(content), 101), *range(len(content) - 8, len(content))]:
+    for length in [*range(0, len(content), 401), *range(len(content) - 8, len(content))]:
         cut.write_bytes(content[:length])
         with pytest.raises(InputError) as error:
             read_exr(cut)
         assert str(cut) in one_line(error)
-
-
-def test_random_damage_never_escapes_as_another_error(tmp_path: Path, image: np.ndarray) -> None:
-    write_exr(tmp_path / "a.exr", image, RGB)
-    content = (tmp_path / "a.exr").read_bytes()
-    generator = np.random.default_rng(0)
-    messages = []
-    for position in generator.integers(0, 450, 200):
-        damaged = bytearray(content)
-        damaged[position] ^= int(generator.integers(1, 256))
-        (tmp_path / "b.exr").write_bytes(damaged)
-        try:
-            read_exr(tmp_path / "b.exr")
-        except InputError as error:
-            messages.append(str(error))
-    assert messages
-    assert not any("\n" in message for message in messages)
-
-
-def _patch(content: bytes, name: bytes, kind: bytes, value: bytes) -> bytes:
-    """Replace the value of a header attribute."""
-    start = content.index(name + b"\0" + kind + b"\0") + len(name) + len(kind) + 2
-    (length,) = struct.unpack_from("<i", content, start)
-    return content[:start] + struct.pack("<i", len(value)) + value + content[start + 4 + length :]
-
-
-def test_unusable_images_are_refused(tmp_path: Path, image: np.ndarray) -> None:
-    write_exr(tmp_path / "a.exr", image, RGB)
-    content = (tmp_path / "a.exr").read_bytes()
-    huge = _patch(content, b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, 2**14, 2**14))
-    files = {
-        "empty": b"",
-        "text": b"hello, this is no image\n" * 20,
-        "huge": huge,
-        "absurd": _patch(content, b"dataWindow", b"box2i", struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2)),
-        "reversed": _patch(content, b"dataWindow", b"box2i", struct.pack("<4i", 5, 5, 0, 0)),
-        "no channels": _patch(content, b"channels", b"chlist", b"\0"),
-    }
-    for name, data in files.items():
-        path = tmp_path / f"{name}.exr"
-        path.write_bytes(data)
-        with pytest.raises(InputError) as error:
-            read_exr(path)
-        assert str(path) in one_line(error)
-    with pytest.raises(InputError, match="no such file"):
-        read_exr(tmp_path / "missing.exr")
-    with pytest.raises(InputError, match="no such file"):
-        read_exr(tmp_path / ("long" * 100 + ".exr"))
-    with pytest.raises(InputError, match="a folder"):
-        read_exr(tmp_path)
-
-
-def test_another_format_named_exr_is_refused(tmp_path: Path, image: np.ndarray) -> None:
-    file = oiio.ImageOutput.create("png")
-    assert file.open(str(tmp_path / "a.png"), oiio.ImageSpec(50, 40, 3, "uint8"))
-    assert file.write_image(image)
-    assert file.close()
-    (tmp_path / "a.png").rename(tmp_path / "a.exr")
-    with pytest.raises(InputError, match="of the format png") as error:
-        read_exr(tmp_path / "a.exr")
-    one_line(error)
-
-
-def test_deep_image_is_refused(tmp_path: Path) -> None:
-    spec = oiio.ImageSpec(4, 3, 3, "half")
-    spec.deep = True
-    data = oiio.DeepData()
-    data.init(spec)
-    data.set_samples(0, 1)
-    file = oiio.ImageOutput.create("openexr")
-    assert file.open(str(tmp_path / "deep.exr"), spec)
-    assert file.write_deep_image(data)
-    assert file.close()
-    with pytest.raises(InputError, match="a deep image") as error:
-        read_exr(tmp_path / "deep.exr")
-    one_line(error)
 
 
 def test_folder_that_cannot_be_written(tmp_path: Path, image: np.ndarray) -> None:
@@ -207,7 +124,7 @@ image = np.random.default_rng(0).random((size, size, 3), dtype=np.float32)
 write_exr(folder / "a.exr", image, ["R", "G", "B"])
 before = (folder / "a.exr").read_bytes()
 unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
-for room in [*range(0, len(before), max(len(before) // 20, 1)), len(before) - 1]:
+for room in [*range(0, len(before), max(len(before) // 8, 1)), len(before) - 1]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
     try:
         write_exr(folder / "a.exr", image, ["R", "G", "B"])
@@ -223,7 +140,7 @@ print("done")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the file size through the POSIX resource limit")
-@pytest.mark.parametrize("size", [8, 100])
+@pytest.mark.parametrize("size", [100])
 def test_full_disk_is_told_and_the_old_file_stays(tmp_path: Path, size: int) -> None:
     command = [sys.executable, "-c", _FULL_DISK, str(tmp_path), str(size)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -252,14 +169,6 @@ def test_write_text_is_whole_or_not_at_all(tmp_path: Path) -> None:
         full()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "eins, zwei, dreißig"
-
-
-def test_writing_through_a_link_keeps_the_link(tmp_path: Path) -> None:
-    (tmp_path / "target.txt").write_text("old")
-    (tmp_path / "link.txt").symlink_to(tmp_path / "target.txt")
-    write_text(tmp_path / "link.txt", "new")
-    assert (tmp_path / "link.txt").is_symlink()
-    assert (tmp_path / "target.txt").read_text() == "new"
 
 
 def test_device_is_never_replaced() -> None:

@@ -1,6 +1,6 @@
 """Files that are whole and yet no image of a frame, or that have names to trip over: refused in one line, or read.
 
-The damaged ones are those of ``test_fuzz_images.py``.
+The damaged ones are those of ``test_fuzz.py``.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def gradient(height: int, width: int, blue: int = 60) -> Picture:
     return np.stack([red, green, np.full_like(red, blue)], -1).astype(np.uint8)
 
 
-@pytest.mark.parametrize("count", [1, 2, 11])
+@pytest.mark.parametrize("count", [1, 11])
 def test_every_picture_is_a_frame(tmp_path: Path, count: int) -> None:
     pictures = [gradient(48, 64, 20 * number) for number in range(count)]
     write_video(tmp_path / "a.mp4", iter(pictures), 12.5)
@@ -145,8 +145,8 @@ first = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
 def peak(count):
     write_video(Path(sys.argv[1]), (np.roll(first, number, 1) for number in range(count)))
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-before = peak(60)
-print((peak(240) - before) / first.nbytes)
+before = peak(30)
+print((peak(210) - before) / first.nbytes)
 """
 
 

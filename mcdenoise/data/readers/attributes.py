@@ -27,31 +27,19 @@ _COPIED = {
 }
 # The types of attributes of the format; the module misreads others under these names.
 _OF_FORMAT = {
-    b"adoptedNeutral": b"v2f",
-    b"cameraColorBalance": b"v2f",
-    b"channels": b"chlist",
-    b"chromaticities": b"chromaticities",
-    b"chunkCount": b"int",
-    b"compression": b"compression",
-    b"dataWindow": b"box2i",
-    b"displayWindow": b"box2i",
-    b"dwaCompressionLevel": b"float",
-    b"envmap": b"envmap",
-    b"lineOrder": b"lineOrder",
-    b"name": b"string",
-    b"originalDataWindow": b"box2i",
-    b"pixelAspectRatio": b"float",
-    b"preview": b"preview",
-    b"screenWindowCenter": b"v2f",
-    b"screenWindowWidth": b"float",
-    b"sensorAcquisitionRectangle": b"box2i",
-    b"sensorCenterOffset": b"v2f",
-    b"sensorOverallDimensions": b"v2f",
-    b"tiles": b"tiledesc",
-    b"type": b"string",
-    # Flat images, and no others are read, have none.
-    b"version": b"",
-}
+    name: kind
+    for kind, names in {
+        b"box2i": b"dataWindow displayWindow originalDataWindow sensorAcquisitionRectangle",
+        b"float": b"dwaCompressionLevel pixelAspectRatio screenWindowWidth",
+        b"int": b"chunkCount",
+        b"string": b"name type",
+        b"v2f": b"adoptedNeutral cameraColorBalance screenWindowCenter sensorCenterOffset sensorOverallDimensions",
+        # Flat images, and no others are read, have none.
+        b"": b"version",
+    }.items()
+    for name in names.split()
+} | {name: name for name in (b"chromaticities", b"compression", b"envmap", b"lineOrder", b"preview")}
+_OF_FORMAT |= {b"channels": b"chlist", b"tiles": b"tiledesc"}
 _ONLY_OF_FORMAT = {b"chlist", b"compression", b"lineOrder", b"tiledesc"}
 
 

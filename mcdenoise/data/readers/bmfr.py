@@ -233,10 +233,14 @@ def open_bmfr(
     _check_complete(path, files, numbers)
     groups = [FileGroup(_STEMS[name], own) for name, own in files.items()]
     parts = [read_image_header(next(own[n] for n in numbers if n in own)).parts[:1] for own in files.values()]
-    layers, samples = {}, None
+    layers: dict[str, Layer] = {}
+    samples: SampleLayers | None = None
     for index, (name, (part,)) in enumerate(zip(files, parts, strict=True)):
         if name == "samples":
-            samples = _samples_of(index, files[name][numbers[0]], part)
+            samples, _ = split_samples(layers_of(index, "", [part]))
+            if samples is None:
+                found = ", ".join(part.channels[:8])
+                raise InputError(f"{files[name][numbers[0]]}: expected layers sample0.RGB, sample1.RGB, found {found}")
         else:
             layers[name] = _layer_of(index, name, files[name], part)
     split = find_splits([], layers["color"], {name: layers[name] for name in (DIFFUSE, SPECULAR) if name in layers})
@@ -281,13 +285,6 @@ def _layer_of(group: int, name: str, files: Mapping[int, Path], part: Part) -> L
     return Layer(group, 0, _STEMS[name], part.channels, letters, anonymous=True, files=pattern)
 
 
-def _samples_of(group: int, path: Path, part: Part) -> SampleLayers:
-    samples, _ = split_samples(layers_of(group, "", [part]))
-    if samples is None:
-        raise InputError(f"{path}: expected layers sample0.RGB, sample1.RGB, ..., found {', '.join(part.channels[:8])}")
-    return samples
-
-
 def _find_noise_seeds(
     path: Path, numbers: list[int], groups: Sequence[FileGroup], files: Files
 ) -> list[list[FileGroup]]:
@@ -324,10 +321,7 @@ def write_bmfr_frame(
     """
     if frame.color.shape[0] != 1:
         raise ValueError(f"frame: expected a batch of 1, found {frame.color.shape[0]}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    _make(folder)
     # Without it, a reader must assume published BMFR data, whose color is divided by albedo.
     if not (folder / _DESCRIPTION).exists():
         write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
@@ -406,13 +400,16 @@ def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tens
     Raises:
         InputError: a file cannot be written.
     """
-    place = folder / CLEAN
+    _make(folder / CLEAN)
+    write_buffer(folder / CLEAN, number, "albedo", albedo)
+    write_buffer(folder / CLEAN, number, "normal", normal)
+
+
+def _make(folder: Path) -> None:
     try:
-        place.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
-    write_buffer(place, number, "albedo", albedo)
-    write_buffer(place, number, "normal", normal)
+        raise InputError(f"{folder}: cannot be created ({error.strerror}); choose another folder") from error
 
 
 def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | None:

@@ -282,18 +282,21 @@ def find_lights(
     for name in expanded:
         found = named(own, name) or named(layers, name)
         if len(found) != 1 or not found[0].is_color or found[0] == color:
-            lit = [layer for layer in known if layer.title in _ADDED] or known
-            advice = f"choose among {', '.join(map(str, lit))}" if lit else "omit the option"
-            # Commas separate the channels of one layer.
-            if "," in name:
-                separate = shlex.join(map(str.strip, name.split(",")))
-                advice = f"separate names by spaces: --layers {separate}; or {advice}"
             raise InputError(
                 f"{where}: expected one layer of light for --layers {name}, found "
-                f"{', '.join(map(str, found)) or 'none'}; {advice}"
+                f"{', '.join(map(str, found)) or 'none'}; {_advice(name, known)}"
             )
         (layer,) = found
         lights[layer.name] = Light((layer, *color_of(layer, own)))
     images = radiance([light.layers[0] for light in lights.values()])
     whole = bool(lights) and images.keys() == lights.keys()
     return lights, left_of(pixels[color], [*images.values()]) if whole else None
+
+
+def _advice(name: str, known: Sequence[Layer]) -> str:
+    lit = [layer for layer in known if layer.title in _ADDED] or known
+    advice = f"choose among {', '.join(map(str, lit))}" if lit else "omit the option"
+    # Commas separate the channels of one layer.
+    if "," not in name:
+        return advice
+    return f"separate names by spaces: --layers {shlex.join(map(str.strip, name.split(',')))}; or {advice}"

@@ -12,7 +12,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -278,11 +278,8 @@ class NoisebaseFiles(Source):
 def find_zips(given: Sequence[Path]) -> list[Path]:
     """The zips among the given files, or in the given folder; empty if there are other files."""
     if len(given) == 1 and os.path.isdir(given[0]):
-        try:
-            names = sorted(name for name in os.listdir(given[0]) if not name.startswith("."))
-        except OSError:
-            return []
-        return [given[0] / name for name in names] if all(Path(each).suffix == SUFFIX for each in names) else []
+        with suppress(OSError):
+            given = [given[0] / name for name in sorted(os.listdir(given[0])) if not name.startswith(".")]
     return list(given) if all(path.suffix == SUFFIX for path in given) else []
 
 
@@ -432,7 +429,6 @@ def _opened(path: Path, index: int | None = None) -> Iterator[_Arrays]:
         raise InputError(
             "noisebase: expected the package zarr, found none; install it with pip install 'mcdenoise[noisebase]'"
         ) from error
-
     try:
         with zipfile.ZipFile(path) as file:
             yield _Arrays(file, index)

@@ -46,7 +46,6 @@ _FEATURES = {"albedo", "normal", "depth"}
 def open_files(
     groups: Sequence[FileGroup],
     choose_numbers: Callable[[list[int]], list[int]],
-    *,
     where: str,
     mapping: Mapping[str, str],
     color_has_albedo: bool | None = None,
@@ -198,15 +197,14 @@ def check_files(
                 f"({_window(main)}), found {_window(part)}; render all layers in one window, or leave this one "
                 f"out with --map {name}="
             )
-    written = dict.fromkeys([color, *shot.choice.written])
-    used = [*dict.fromkeys([*written, *shot.choice.layers.values()])]
+    written = [color, *shot.choice.written]
+    used = dict.fromkeys([*written, *shot.choice.layers.values()])
     everywhere = {layer for split in splits for layer in split.layers}
     everywhere |= set() if samples is None else samples.layers
-    groups = {layer.group for layer in (*used, *everywhere)}
-    windows: set[Window] = set()
+    files = {layer.group: shot.groups[layer.group].files for layer in (*used, *everywhere)}
+    windows: set[Window | None] = set()
     colors: set[Window] = set()
     for number in shot.numbers:
-        files = {group: shot.groups[group].files for group in groups}
         headers = {group: read_image_header(own[number]) for group, own in files.items() if number in own}
         found = {layer: _window_in(headers[layer.group], layer) for layer in used if layer.group in headers}
         for layer, window in found.items():
@@ -221,7 +219,7 @@ def check_files(
             for layer in everywhere
             if layer.group in headers and _window_in(headers[layer.group], layer) == found[color]
         }
-        windows |= {window for window in found.values() if window is not None}
+        windows |= {*found.values()}
         colors |= {window for layer in written if (window := found.get(layer)) is not None}
     if len(windows) > 1:
         shot.window = functools.reduce(Window.joined, colors)

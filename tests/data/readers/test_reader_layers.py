@@ -35,24 +35,15 @@ def three(name: str, components: str = "RGB") -> str:
 
 # The layers have these names in the files of each renderer; ~ stands for a blank.
 TABLE = {
-    "blender 4": [
+    "blender": [
         (three("ViewLayer.Combined", "BGRA"), "ViewLayer.Combined.RGBA", "color"),
         (three("ViewLayer.Noisy~Image"), "ViewLayer.Noisy Image.RGB", "color"),
-        (three("ViewLayer.Denoising~Albedo"), "ViewLayer.Denoising Albedo.RGB", "albedo"),
-        (three("ViewLayer.DiffCol"), "ViewLayer.DiffCol.RGB", "albedo"),
-        (three("ViewLayer.Denoising~Normal", "XYZ"), "ViewLayer.Denoising Normal.XYZ", "normal"),
-        (three("ViewLayer.Normal", "XYZ"), "ViewLayer.Normal.XYZ", "normal"),
-        ("ViewLayer.Depth.Z", "ViewLayer.Depth.Z", "depth"),
         ("ViewLayer.Depth.V", "ViewLayer.Depth.V", "depth"),
-        ("ViewLayer.Denoising~Depth.Z", "ViewLayer.Denoising Depth.Z", "depth"),
-        (three("ViewLayer.Position", "XYZ"), "ViewLayer.Position.XYZ", "position"),
         (three("ViewLayer.Vector", "WXYZ"), "ViewLayer.Vector.XYZW", "motion"),
         (three("ViewLayer.GlossDir"), "ViewLayer.GlossDir.RGB", None),
         (three("ViewLayer.Shadow~Catcher"), "ViewLayer.Shadow Catcher.RGB", None),
         ("ViewLayer.Debug~Sample~Count.X", "ViewLayer.Debug Sample Count.X", None),
         (three("ViewLayer.CryptoObject00", "RGBA"), "ViewLayer.CryptoObject00.RGBA", None),
-    ],
-    "view layers with dots and blanks": [
         (three("Main~Layer~v1.2.Combined"), "Main Layer v1.2.Combined.RGB", "color"),
         (three("a.b.c.Denoising~Albedo"), "a.b.c.Denoising Albedo.RGB", "albedo"),
         (three("Depth.Normal", "XYZ"), "Depth.Normal.XYZ", "normal"),
@@ -61,71 +52,33 @@ TABLE = {
     ],
     "mitsuba": [
         ("B G R", "render.RGB", "color"),
-        (three("albedo"), "albedo.RGB", "albedo"),
-        (three("sh_normal", "XYZ"), "sh_normal.XYZ", "normal"),
-        (three("geo_normal", "XYZ"), "geo_normal.XYZ", "normal"),
         ("dd.y.T R G B", "dd.y.T", None),
         (three("nn", "XYZ"), "nn.XYZ", None),
-        (three("position", "XYZ"), "position.XYZ", "position"),
     ],
     "pbrt": [
-        (three("Albedo"), "Albedo.RGB", "albedo"),
-        (three("Ns", "XYZ"), "Ns.XYZ", "normal"),
-        (three("N", "XYZ"), "N.XYZ", "normal"),
         ("Nsx Nsy Nsz Nx Ny Nz", "Nsx", None),
-        (three("P", "XYZ"), "P.XYZ", "position"),
-        (three("Variance"), "Variance.RGB", "variance"),
         (three("RelativeVariance"), "RelativeVariance.RGB", None),
         ("dzdx dzdy", "dzdx", None),
     ],
     "arnold": [
         ("A B G R Z", "RGBA", "color"),
         ("A B G R Z", "Z", "depth"),
-        (three("denoise_albedo"), "denoise_albedo.RGB", "albedo"),
-        (three("diffuse_albedo"), "diffuse_albedo.RGB", "albedo"),
         (three("specular_albedo"), "specular_albedo.RGB", None),
-        (three("N", "XYZ"), "N.XYZ", "normal"),
         (three("motionvector", "RG"), "motionvector.RG", "motion"),
-        (three("variance"), "variance.RGB", "variance"),
         (three("diffuse_direct"), "diffuse_direct.RGB", None),
     ],
     "renderman": [
         ("Ci.r Ci.g Ci.b a", "Ci.RGB", "color"),
         ("Ci.r Ci.g Ci.b a", "a", "alpha"),
-        (three("albedo", "rgb"), "albedo.RGB", "albedo"),
         (three("albedo_var", "rgb"), "albedo_var.RGB", None),
         (three("albedo_mse", "rgb"), "albedo_mse.RGB", None),
-        (three("normal", "xyz"), "normal.XYZ", "normal"),
-        ("zfiltered R G B", "zfiltered", "depth"),
         ("zfiltered_var R G B", "zfiltered_var", None),
-        (three("backward", "xyz"), "backward.XYZ", "motion"),
         (three("forward", "xyz"), "forward.XYZ", None),
         ("sampleCount R G B", "sampleCount", None),
     ],
-    "v-ray": [
-        (three("diffuseFilter"), "diffuseFilter.RGB", "albedo"),
-        (three("normals", "XYZ"), "normals.XYZ", "normal"),
+    "others": [
         (three("VRayZDepth"), "VRayZDepth.RGB", "depth"),
-        (three("velocity", "XYZ"), "velocity.XYZ", "motion"),
         (three("effectsResult"), "effectsResult.RGB", None),
-    ],
-    "redshift": [
-        (three("DiffuseFilter"), "DiffuseFilter.RGB", "albedo"),
-        (three("BumpNormals"), "BumpNormals.RGB", "normal"),
-        (three("WorldPosition"), "WorldPosition.RGB", "position"),
-        (three("MotionVectors"), "MotionVectors.RGB", "motion"),
-    ],
-    "octane": [
-        (three("Beauty", "RGBA"), "Beauty.RGBA", "color"),
-        (three("Beauty_Noisy", "RGBA"), "Beauty_Noisy.RGBA", "color"),
-        (three("OptixNormals"), "OptixNormals.RGB", "normal"),
-    ],
-    "corona": [
-        (three("VisibleNormals", "XYZ"), "VisibleNormals.XYZ", "normal"),
-        (three("VisibleDiffuse"), "VisibleDiffuse.RGB", "albedo"),
-    ],
-    "tungsten": [
-        (three("albedo"), "albedo.RGB", "albedo"),
         (three("normalVariance"), "normalVariance.RGB", None),
     ],
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -210,26 +209,6 @@ def test_the_parts_are_read_on_request_only(tmp_path: Path, save: Save) -> None:
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", blender()[0]))
     assert sequence.frame(1, buffers={"albedo"}).diffuse is None
     assert sequence.frame(1, buffers={"specular"}).diffuse is not None
-
-
-def test_real_files_of_cycles(rendered: Path) -> None:
-    for name in ("blender", "blender5"):
-        sequence = open_sequence(rendered / name)
-        assert sequence.buffers >= {"diffuse", "specular", "specular_albedo"}
-        frame = sequence.frame(1)
-        assert frame.diffuse is not None
-        assert frame.specular is not None
-        # Three roundings to half floats lie between the sum and the color.
-        torch.testing.assert_close(frame.diffuse + frame.specular, frame.color, rtol=3 * 2.0**-11, atol=1e-6)
-
-
-def test_inspect_names_the_methods_that_use_the_parts(run: Run, rendered: Path, tmp_path: Path) -> None:
-    status, printed, _ = run("inspect", rendered / "blender", "--json", tmp_path / "found.json")
-    assert status == 0
-    assert "diffuse: of use to kpcn\n" in printed
-    assert "specular: of use to kpcn\n" in printed
-    told = json.loads((tmp_path / "found.json").read_text())
-    assert told["of_use_to"]["diffuse"] == ["kpcn"]
 
 
 @pytest.mark.parametrize("split", [True, False])

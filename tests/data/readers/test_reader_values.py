@@ -59,7 +59,7 @@ def blurred(image: Image, sigma: float) -> Image:
 
 
 @pytest.mark.parametrize("kind", ["colored", "grey"])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) -> None:
     albedo, irradiance = texture(kind), light(seed)
     with_it, without = albedo_included(albedo * irradiance, albedo), albedo_included(irradiance, albedo)
@@ -75,7 +75,7 @@ def test_one_noisy_frame_tells_whether_the_albedo_is_in(kind: str, seed: int) ->
     assert albedo_included(spoilt, albedo).included is True
 
 
-@pytest.mark.parametrize("sigma", [2, 6, 12])
+@pytest.mark.parametrize("sigma", [2, 12])
 @pytest.mark.parametrize("kind", ["colored", "grey"])
 def test_a_blurred_color_is_never_taken_for_light_without_albedo(kind: str, sigma: float) -> None:
     albedo, random = texture(kind), np.random.default_rng(0)
@@ -93,11 +93,11 @@ def test_a_blurred_color_is_never_taken_for_light_without_albedo(kind: str, sigm
     assert albedo_included(color, albedo).included is not False
 
 
-@pytest.mark.parametrize("seen_through", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize("seen_through", [0.02, 0.3])
 @pytest.mark.parametrize("kind", ["colored", "grey"])
 def test_fog_and_glass_are_never_taken_for_light_without_albedo(kind: str, seen_through: float) -> None:
     albedo = texture(kind)
-    for seed in range(3):
+    for seed in range(2):
         irradiance = light(seed)
         fog = seen_through * albedo * irradiance + (1 - seen_through) * 0.3
         assert albedo_included(fog, albedo).included is not False
@@ -180,7 +180,7 @@ def directions(seed: int, count: int = 2000) -> Image:
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
 
 
-@pytest.mark.parametrize("noise", [0, 0.02, 0.1])
+@pytest.mark.parametrize("noise", [0, 0.1])
 @pytest.mark.parametrize("shortened", [False, True])
 def test_normals_signed_or_encoded(noise: float, shortened: bool) -> None:
     normal = directions(0)
@@ -294,7 +294,7 @@ def test_motion_that_contradicts_the_frames_is_not_used() -> None:
     assert match_cameras([(stored, np.full(stored.shape, 4.0))], USUAL_MOTION) is None
 
 
-@pytest.mark.parametrize("horizon", [12, 30, 50])
+@pytest.mark.parametrize("horizon", [12, 50])
 @pytest.mark.parametrize("nothing", [np.inf, -np.inf, np.nan, 1e10])
 def test_motion_is_compared_where_there_is_one(nothing: float, horizon: int) -> None:
     """A camera that moves over a floor: the sky above has no motion, and matches itself at rest."""
@@ -373,9 +373,9 @@ def test_a_fast_pan_is_no_contradiction(pan: tuple[float, float], contrast: floa
         assert match_motion([(now, before, stored)], parts)[0][:2] == (sign, sign)
 
 
-@pytest.mark.parametrize("frames", [(1, 2), (2, 3), (3, 4)])
+@pytest.mark.parametrize("frames", [(1, 2), (3, 4)])
 @pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
-@pytest.mark.parametrize("features", [("albedo", "normal"), ("albedo",), ("normal",), ("albedo", "turned")])
+@pytest.mark.parametrize("features", [("albedo",), ("normal",), ("albedo", "turned")])
 def test_two_small_frames_of_a_renderer_tell_the_sign(
     frames: tuple[int, int], signs: tuple[int, int], features: tuple[str, ...], others: Any
 ) -> None:

@@ -285,24 +285,7 @@ INVALID = [
     *(
         (name, kind, value)
         for kind, value in ((b"string", b"words of text"), (b"float", b"\0\0\xc0\x7f"), (b"m33f", bytes(36)))
-        for name in (
-            b"adoptedNeutral",
-            b"chromaticities",
-            b"chunkCount",
-            b"envmap",
-            b"framesPerSecond",
-            b"keyCode",
-            b"multiView",
-            b"originalDataWindow",
-            b"preview",
-            b"sensorCenterOffset",
-            b"textureformat",
-            b"tiles",
-            b"timeCode",
-            b"version",
-            b"worldToCamera",
-            b"wrapmodes",
-        )
+        for name in (b"chromaticities", b"chunkCount", b"keyCode", b"preview", b"tiles", b"version", b"worldToCamera")
     ),
 ]
 
@@ -502,7 +485,7 @@ number, image = sequence.numbers[0], np.ones((*sequence.size, 3), np.float32)
 path = sequence.write(out, number, image)
 before = path.read_bytes()
 unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
-for room in [*range(0, len(before), max(len(before) // 20, 1)), len(before) - 1]:
+for room in [*range(0, len(before), max(len(before) // 8, 1)), len(before) - 1]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
     try:
         sequence.write(out, number, image)
@@ -518,7 +501,7 @@ print("done")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the file size through the POSIX resource limit")
-@pytest.mark.parametrize("source", ["blender/shot_0001.exr", "blender5/shot_0001.exr", "render.hdr", "render.png"])
+@pytest.mark.parametrize("source", ["blender5/shot_0001.exr", "render.hdr", "render.png"])
 def test_a_full_disk_is_told_and_the_old_file_stays(source: str, rendered: Path, tmp_path: Path) -> None:
     path = rendered / source
     if not path.exists():
@@ -547,7 +530,7 @@ def test_a_file_that_changed_meanwhile_is_told(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("level", [None, 10.0, 200.0, 1000.0])
+@pytest.mark.parametrize("level", [None, 1000.0])
 @pytest.mark.parametrize("compression", [OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION])
 @pytest.mark.parametrize("kind", [np.float16, np.float32])
 def test_bright_pixels_stay_finite_under_dwa(tmp_path: Path, compression: Any, level: float | None, kind: Any) -> None:
