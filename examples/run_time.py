@@ -29,14 +29,13 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import parse_method
 from mcdenoise.models import (
+    PRECISIONS,
     Accumulated,
     Precision,
     Skipping,
     computing_in,
     parts_of,
-    precisions_of,
     pretrained_models,
-    quantize,
 )
 
 OIDN = (
@@ -47,10 +46,10 @@ OIDN = (
 
 
 def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
-    """Calls of a method on this frame; for trainable models, one in every precision available here."""
+    """Calls of a method on this frame; for trainable models, one in every precision."""
     spelling = parse_method(spelt)
     settings = {"threads": threads, **spelling.settings} if spelling.takes("threads") else spelling.settings
-    # Random weights take the same time as trained ones, but have no calibration.
+    # Random weights take the same time as trained ones.
     pretrained = spelling.weights is None and spelling.model in pretrained_models()
     model = create_model(spelling.model, pretrained=pretrained, weights=spelling.weights, **settings)
     if isinstance(model, torch.nn.Module):
@@ -64,9 +63,7 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
         with torch.no_grad(), computing_in(precision, cpu):
             return model(frame)
 
-    precisions = precisions_of(model) if model.needs.trainable else ("float32",)
-    if "int8" in precisions:
-        quantize(model, cpu)
+    precisions = PRECISIONS if model.needs.trainable else ("float32",)
     names = {precision: "" if precision == "float32" else f", {precision}" for precision in precisions}
     return {f"{spelling.name}{mark}": partial(call, precision) for precision, mark in names.items()}
 

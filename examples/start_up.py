@@ -1,7 +1,7 @@
 """Measure whole processes that denoise one frame from EXR to EXR, with this package and with Open Image Denoise.
 
     python examples/start_up.py
-    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precisions auto,int8
+    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precisions auto,float32
 
 Every round starts each process once, one after the other, so that other work of the machine affects all of them
 equally; the first round, in which files are read from the disk and kernels are compiled, does not count. The script

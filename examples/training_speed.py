@@ -31,7 +31,7 @@ from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.models import DEFAULT, FloatPrecision, create_model
+from mcdenoise.models import DEFAULT, Precision, create_model
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import ClipSampler
@@ -96,8 +96,8 @@ def main() -> None:
             raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     fix_threads(options.threads)
     keep_heap()
-    runs: dict[tuple[FloatPrecision, str], Callable[[int], None]] = {}
-    for precision in get_args(FloatPrecision):
+    runs: dict[tuple[Precision, str], Callable[[int], None]] = {}
+    for precision in get_args(Precision):
         config = TrainConfig(
             model=options.model,
             batch=options.batch,
@@ -114,7 +114,7 @@ def main() -> None:
         for backend in ("fast", "plain"):
             runs[precision, backend] = steps(config, sampler, backend == "plain")
 
-    times: dict[tuple[FloatPrecision, str], list[float]] = {run: [] for run in runs}
+    times: dict[tuple[Precision, str], list[float]] = {run: [] for run in runs}
     for number in range(WARM_UP + options.rounds):
         for run, step in runs.items():
             start = time.perf_counter()

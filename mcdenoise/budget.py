@@ -17,7 +17,7 @@ from mcdenoise.data import Sequence
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import Precision, create_model, precisions_of, pretrained_models
+from mcdenoise.models import PRECISIONS, Precision, pretrained_models
 from mcdenoise.reading import read_text
 from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep
@@ -122,11 +122,7 @@ def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[i
     key = f"{machine}, mcdenoise {version('mcdenoise')}, torch {torch.__version__}, {width}x{height}"
     known = _read(cache)
     own = known.setdefault(key, {})
-    choices = [
-        Choice(model, precision, 0.0)
-        for model in pretrained_models()
-        for precision in precisions_of(create_model(model, pretrained=True))
-    ]
+    choices = [Choice(model, precision, 0.0) for model in pretrained_models() for precision in PRECISIONS]
     measured = []
     for done, choice in enumerate(choices, start=1):
         if choice.name not in own:

@@ -39,7 +39,6 @@ from mcdenoise.models import (
     find_model,
     has_network,
     listening,
-    quantize,
     timed,
 )
 from mcdenoise.models._adapter import as_model
@@ -58,7 +57,7 @@ from mcdenoise.motion import MOTION_PAIRS, Seen, doubt_motion, seen_in
 from mcdenoise.noise import noise_is_repeated, noise_of, thinned
 from mcdenoise.sampling import has_exact_features
 
-AskedPrecision = Literal["auto", "float32", "bfloat16", "int8"]
+AskedPrecision = Literal["auto", "float32", "bfloat16"]
 
 # Level of noise up to which bfloat16 makes errors larger: by 41 % at 0.001, 6 % at 0.006, 2 % at 0.02, 1 % at 0.06
 # (oidn_tuned on even surfaces, where they are largest).
@@ -172,9 +171,7 @@ class Denoiser:
             all the same (on a GPU by the noise of the frame before, and the first one always). ``"auto"`` chooses it
             for a trained model of the zoo if it is faster on this machine (see
             :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours, and with
-            ``differentiable``. ``"int8"`` computes the U-Nets of a calibrated model in 8-bit integers, on processors
-            with 8-bit dot products; docs/performance.md measures the loss of quality. The attribute ``precision`` holds
-            the chosen precision, and the report the reason.
+            ``differentiable``. The attribute ``precision`` holds the chosen precision, and the report the reason.
         keep_all: skip nothing, even if the scene does not need it, nor a frame that repeats the noise of the last one.
         tile: largest side of a tile in pixels, a multiple of 32 that is at least 64. The result is that of the whole
             image, up to the rounding of convolutions; overlapping margins cost time. By default tiles are as large as
@@ -242,9 +239,6 @@ class Denoiser:
         self._asked, self._given, self._limits = precision, settings, (tile, max_memory)
         if model is None and weights is not None:
             model = model_of(Path(weights))
-        elif model is None and precision == "int8":
-            # The only calibrated one of those that are picked.
-            model = DEFAULT
         self._report = FrameReport()
         # Whether the last frame whose noise is known has enough of it to be computed in bfloat16.
         self._rounds = False
@@ -277,10 +271,6 @@ class Denoiser:
         self.model = as_model(model)
         self._name = name if of_zoo else name_of(self.model)
         self.precision, self._why_precision = self._chosen(of_zoo=of_zoo)
-        if self.precision == "int8":
-            if self.differentiable:
-                raise InputError("precision: expected float32 or bfloat16 with differentiable, found int8")
-            quantize(self.model, self.device)
         self._tiles = Division(self.model, *self._limits, self.device)
 
     @_in_turn

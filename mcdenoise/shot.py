@@ -37,7 +37,7 @@ class ShotSettings:
         device: where the model runs, cpu or cuda.
         threads: CPU threads; torch's choice by default.
         precision: precision of the network's convolutions; auto chooses bfloat16 if the processor supports it and it is
-            faster, which is measured once per machine; int8 is for calibrated models, see `mcdenoise calibrate`.
+            faster, which is measured once per machine.
         map: the layer to read a buffer from if names do not tell, such as albedo=RGBA.diff; 'motion=' reads none.
         color_without_albedo: the noisy color was divided by the albedo, and has to be multiplied by it.
         color_with_albedo: the noisy color includes the albedo. By default this is determined from the values; if they

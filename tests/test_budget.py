@@ -16,7 +16,6 @@ from mcdenoise.cli import main
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.models import pretrained_models
-from mcdenoise.nn.int8 import has_int8
 from mcdenoise.results import Cell, Machine, Method, Results, Scene
 
 TIMES = {"cascaded_v2": 300.0, "cascaded_v2_small": 170.0, "cascaded_v2_tiny": 80.0, "cascaded_v2_micro": 50.0}
@@ -123,9 +122,7 @@ def test_times_are_measured_once_for_each_size_and_number_of_threads(
         path.unlink()
     sequence = open_sequence(sequence.root)
     first = choose_model(sequence, **bare)
-    # The methods run in both float types, and in integers where the model and the machine can.
-    calibrated = {name for name in pretrained_models() if name.startswith("cascaded_v2") and has_int8()}
-    count = 2 * len(pretrained_models()) + len(calibrated)
+    count = 2 * len(pretrained_models())
     assert len(measured) == count
     assert choose_model(sequence, **bare) == first
     assert len(measured) == count

@@ -119,7 +119,7 @@ def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], comma
     status, text, errors = run(command, "--help")
     assert (status, errors) == (0, "")
     parameters = inspect.signature(load_command(command)).parameters
-    names = set(parameters) - POSITIONAL - {"export": {"model"}, "calibrate": {"weights"}}.get(command, set())
+    names = set(parameters) - POSITIONAL - {"export": {"model"}}.get(command, set())
     for group, settings in (("config", TrainConfig), ("rendering", RenderOptions), ("shot", ShotSettings)):
         if group in names:
             names = names - {group} | {field.name for field in dataclasses.fields(settings)}

@@ -19,7 +19,6 @@ from torch import nn
 from mcdenoise import Frame
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.models import create_model, save_weights
-from mcdenoise.nn.int8 import has_int8
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RENDERERS = Path(__file__).parent / "data" / "renderers"
@@ -258,8 +257,7 @@ def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     arguments = ("--models", *models, "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
     lines = run("run_time.py", *arguments).splitlines()
     tiny = "cascaded_v2_tiny(alpha_min=0.2)"
-    integers = [f"{tiny}, int8"] if has_int8() else []
-    names = ["accumulated", tiny, f"{tiny}, bfloat16", *integers, "compose_denoiser.py:method"]
+    names = ["accumulated", tiny, f"{tiny}, bfloat16", "compose_denoiser.py:method"]
     assert [line[:44].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
     written = json.loads(file.read_text())

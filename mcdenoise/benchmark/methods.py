@@ -15,14 +15,12 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
 from mcdenoise.models import (
-    FLOATS,
     PRECISIONS,
     Output,
     Skipping,
     has_network,
     list_models,
     parts_of,
-    precisions_of,
     pretrained_models,
 )
 from mcdenoise.models._stopwatch import Moment, Stopwatch
@@ -110,7 +108,7 @@ def make_method(method: Method, *, threads: int | None = None, device: str = "cp
 def choose_methods(
     names: str | None = None,
     *,
-    precisions: str = ",".join(FLOATS),
+    precisions: str = ",".join(PRECISIONS),
     keep_all: bool = False,
     baselines: Collection[str] = BASELINES,
 ) -> list[Method]:
@@ -120,8 +118,7 @@ def choose_methods(
         names: methods separated by commas, see :func:`mcdenoise.methods.split_methods`; ``"pretrained"`` means all
             models with shipped weights, ``None`` means :data:`COMPARED`, ``"all"`` means these and every other
             registered model, and ``"none"`` means none.
-        precisions: precisions of the convolutions of trainable models, separated by commas: ``float32``, ``bfloat16``,
-            and ``int8`` for models that are calibrated for it.
+        precisions: precisions of the convolutions of trainable models, separated by commas: ``float32``, ``bfloat16``.
         keep_all: add a second variant of each method that skips work, which skips nothing.
         baselines: methods that are always included, first in the list.
 
@@ -184,8 +181,8 @@ def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool)
         return
     weights = sum(parameter.numel() for parameter in model.parameters()) if isinstance(model, nn.Module) else None
     whole = (False, True) if keep_all and next(parts_of(model, Skipping), None) else (False,)
-    for precision in precisions_of(model):
-        for everything in whole if precision in precisions else ():
+    for precision in (each for each in PRECISIONS if each in precisions):
+        for everything in whole:
             name = method.name if precision == "float32" else f"{method.name}, {precision}"
             name += KEEP_ALL if everything else ""
             yield replace(

@@ -35,7 +35,6 @@ COMMANDS = {
     "generate": "Render random scenes for training.",
     "train": "Train a model on sequences with references.",
     "sweep": "Train the runs of recipes with several seeds, by many processes or machines.",
-    "calibrate": "Calibrate weights for --precision int8.",
     "evaluate": "Compare a folder of denoised images with references.",
     "benchmark": "Measure error and run time of models and other denoisers.",
     "report": "Write the web page and the plots of a finished benchmark.",

@@ -68,8 +68,8 @@ def benchmark(
             "all" for every model, where those without weights are listed as missing; or "none". By default the models
             with shipped weights, filters, and other denoisers; with --suite, the two between which `mcdenoise denoise`
             chooses. The noisy input and accumulation alone are always included.
-        precisions: precisions of the convolutions of trainable models: float32, bfloat16, and int8 for calibrated
-            weights; float32,bfloat16 by default, float32 with --suite.
+        precisions: precisions of the convolutions of trainable models: float32,bfloat16 by default, float32
+            with --suite.
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.
         rounds: number of timed repetitions of each frame and of each size; 3 by default, 5 with --ops, 1 with --suite.
         threads: number of CPU threads of all methods; torch's default if not given.

@@ -191,10 +191,8 @@ def _check(film: Film, device: str) -> None:
     checked = set()
     for shot in film.shots:
         settings = replace(shot.settings, frames=None, device=device or shot.settings.device)
-        # To measure which precision is fast takes time, and one that is not named is checked with its model.
-        named = settings.model is not None or settings.weights is not None
-        if settings.precision != "int8" or not named:
-            settings = replace(settings, precision="float32")
+        # To measure which precision is fast takes time.
+        settings = replace(settings, precision="float32")
         if settings not in checked:
             checked.add(settings)
             try:

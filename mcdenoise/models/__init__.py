@@ -6,16 +6,11 @@ from mcdenoise.models._journal import Journal, Stage, listening, note, summarize
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview, users_of
 from mcdenoise.models._precision import (
-    FLOATS,
     PRECISIONS,
-    FloatPrecision,
     Precision,
-    calibrating,
     computing_in,
     fastest_precision,
     has_network,
-    precisions_of,
-    quantize,
 )
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model, troubles
 from mcdenoise.models._remembered import frames_remembered
@@ -53,7 +48,6 @@ __all__ = [
     "DEFAULT",
     "EXACT",
     "FILTERED",
-    "FLOATS",
     "PRECISIONS",
     "TOLERANCE",
     "Accumulated",
@@ -62,7 +56,6 @@ __all__ = [
     "CoarseToFine",
     "Demodulated",
     "Exposed",
-    "FloatPrecision",
     "FromBuffers",
     "Journal",
     "Model",
@@ -81,7 +74,6 @@ __all__ = [
     "answered",
     "as_model",
     "build_model",
-    "calibrating",
     "carried",
     "compared_models",
     "computing_in",
@@ -100,10 +92,8 @@ __all__ = [
     "note",
     "overview",
     "parts_of",
-    "precisions_of",
     "prepared",
     "pretrained_models",
-    "quantize",
     "register_model",
     "save_weights",
     "start_with",

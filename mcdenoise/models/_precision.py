@@ -20,17 +20,12 @@ from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._wrapper import Wrapper, parts_of
-from mcdenoise.nn import UNet
-from mcdenoise.nn.int8 import has_int8, integers
 from mcdenoise.nn.oidn import OidnUNet
 from mcdenoise.reading import read_text
 from mcdenoise.user_cache import cache_file, keep
 
-FloatPrecision = Literal["float32", "bfloat16"]
-Precision = Literal["float32", "bfloat16", "int8"]
-# Every model runs in these.
-FLOATS: tuple[FloatPrecision, ...] = ("float32", "bfloat16")
-PRECISIONS: tuple[Precision, ...] = (*FLOATS, "int8")
+Precision = Literal["float32", "bfloat16"]
+PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
 # A fixed precision for callers that need the same result on every machine, unlike "auto".
 ENVIRONMENT = "MCDENOISE_PRECISION"
 # Minimum speed-up of bfloat16; a smaller one is not worth the rounding.
@@ -57,10 +52,10 @@ def fastest_precision(device: torch.device) -> Chosen:
         InputError: the environment variable does not name a precision.
     """
     if own := os.environ.get(ENVIRONMENT):
-        for known in FLOATS:
+        for known in PRECISIONS:
             if own == known:
                 return Chosen(known, f"the environment variable {ENVIRONMENT} says so")
-        raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(FLOATS)}, found '{own}'")
+        raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(PRECISIONS)}, found '{own}'")
     if not _has_bfloat16(device):
         return Chosen("float32", "the processor has no bfloat16")
     cache, key = cache_file("precision.json"), _machine(device)
@@ -82,65 +77,11 @@ def has_network(model: Model) -> bool:
     return model.needs.trainable or loads or any(True for _ in parts_of(model, OidnUNet))
 
 
-def precisions_of(model: Model) -> tuple[Precision, ...]:
-    """The precisions in which a model can run on this machine's CPU."""
-    return PRECISIONS if has_int8() and _is_calibrated(model) else FLOATS
-
-
-def quantize(model: Model, device: torch.device) -> None:
-    """Prepare the U-Nets of a model for computing in integers, see :mod:`mcdenoise.nn.int8`.
-
-    Raises:
-        InputError: the U-Nets are not calibrated, or the processor does not support it.
-    """
-    if device.type != "cpu" or not has_int8():
-        raise InputError(
-            "precision: expected a processor with dot products of 8-bit integers (VNNI) for int8, found none; "
-            "take bfloat16 or float32"
-        )
-    unets = list(parts_of(model, UNet))
-    if not _is_calibrated(model):
-        found = "one that is not" if unets else "one without a U-Net that could be"
-        raise InputError(
-            f"precision: expected a model that is calibrated for int8, found {found}; "
-            "see `mcdenoise calibrate --help`, or take bfloat16 or float32"
-        )
-    for unet in unets:
-        try:
-            unet.quantize()
-        except ValueError as error:
-            raise InputError(f"precision: int8: {error}; calibrate the weights again") from error
-
-
-@contextmanager
-def calibrating(model: Model) -> Iterator[None]:
-    """Record the value ranges of the model's U-Nets while they run inside this block.
-
-    Raises:
-        InputError: the model has no U-Net.
-    """
-    unets = list(parts_of(model, UNet))
-    if not unets:
-        raise InputError("model: expected one with a U-Net of `mcdenoise.nn`, found none; no other is computed in int8")
-    handles = [unet.register_forward_pre_hook(lambda own, given: own.calibrate(*given)) for unet in unets]
-    try:
-        yield
-    finally:
-        for handle in handles:
-            handle.remove()
-
-
 @contextmanager
 def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
-    """Run convolutions in this precision; for int8, run the remaining ones in bfloat16 if the processor supports it."""
-    rounded = precision == "bfloat16" or (precision == "int8" and _has_bfloat16(device))
-    with torch.autocast(device.type, torch.bfloat16, enabled=rounded), integers(precision == "int8"):
+    """Run convolutions in this precision."""
+    with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         yield
-
-
-def _is_calibrated(model: Model) -> bool:
-    ranges = [unet.ranges for unet in parts_of(model, UNet)]
-    return bool(ranges) and all(each is not None for each in ranges)
 
 
 def _has_bfloat16(device: torch.device) -> bool:
@@ -159,14 +100,14 @@ def _measured(device: torch.device) -> float:
     weight = torch.full((_CHANNELS, _CHANNELS, 3, 3), 0.01, device=device)
     image = torch.full((1, _CHANNELS, _SIDE, _SIDE), 0.01, device=device)
     image = image.contiguous(memory_format=torch.channels_last)
-    times: dict[FloatPrecision, list[float]] = {precision: [] for precision in FLOATS}
+    times: dict[Precision, list[float]] = {precision: [] for precision in PRECISIONS}
     watch = Stopwatch(device)
     with _measuring, torch.inference_mode():
         # On a busy machine, several threads would mostly wait for one another.
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            for precision in FLOATS * _ROUNDS:
+            for precision in PRECISIONS * _ROUNDS:
                 with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
                     start = watch.mark()
                     F.conv2d(image, weight, padding=1)

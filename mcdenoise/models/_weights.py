@@ -20,7 +20,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import Entry, build_model, find_model, is_registered, outline_model
-from mcdenoise.nn import UNet
 from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"
@@ -107,11 +106,16 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
     # The settings come from the file, so that a change of defaults in the code cannot change what a file means.
     every = {**description["settings"], **settings}
     with safe_open(path, framework="pt") as file:
-        shapes = {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118 - it is no dict
+        keys = set(file.keys())
+        # Older files also hold the ranges of U-Nets for 8-bit integers.
+        ranges = {
+            f"{key.removesuffix('encoder.0.0.weight')}ranges" for key in keys if key.endswith(".encoder.0.0.weight")
+        }
+        shapes = {key: tuple(file.get_slice(key).get_shape()) for key in keys - ranges}
         try:
             if entry.of_zoo and description["settings"] != entry.architecture:
                 # Shapes are compared before memory is taken, of which a header can ask for any amount.
-                _check_shapes(path, found, _shapes(outline_model(name, every), shapes), shapes)
+                _check_shapes(path, found, _shapes(outline_model(name, every)), shapes)
             with without_draws():
                 model = build_model(name, **every)
         except (TypeError, ValueError, RuntimeError, ArithmeticError, LookupError, MemoryError) as error:
@@ -123,16 +127,13 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
                 str(error) if isinstance(error, InputError) else f"expected settings of model '{found}', found {given}"
             )
             raise InputError(f"{where}{reason}") from error
-        _check_shapes(path, found, _shapes(model, shapes), shapes)
-        tensors = {key: file.get_tensor(key) for key in shapes}
+        _check_shapes(path, found, _shapes(model), shapes)
+        tensors = {key: file.get_tensor(key) for key in keys}
     if description.get("sha256") != _digest(tensors):
         raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
-    for name, unet in _unets(model).items():
-        # Only a calibrated network has ranges.
-        if (ranges := tensors.get(f"{name}.ranges")) is not None:
-            unet.ranges = torch.zeros(ranges.shape)
     weights = _named(model)
-    for key, tensor in tensors.items():
+    for key in shapes:
+        tensor = tensors[key]
         if weights[key].is_floating_point() and not tensor.is_floating_point():
             raise InputError(f"{path}: layer '{key}': expected floating-point weights, found {tensor.dtype}")
         if not tensor.isfinite().all():
@@ -161,10 +162,8 @@ def model_of(path: Path) -> str:
     raise InputError(f"{path}: expected weights of a model that `mcdenoise models` lists, found those of '{found}'")
 
 
-def _shapes(model: Model, found: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """The shapes of a model's weights, with the ranges of those U-Nets for which ranges were found."""
-    ranges = {key: found[key] for name in _unets(model) if (key := f"{name}.ranges") in found}
-    return {key: tuple(tensor.shape) for key, tensor in _named(model).items()} | ranges
+def _shapes(model: Model) -> dict[str, tuple[int, ...]]:
+    return {key: tuple(tensor.shape) for key, tensor in _named(model).items()}
 
 
 def _check_shapes(
@@ -261,8 +260,7 @@ def start_with(model: Model, name: str, **settings: Any) -> str:
     except InputError as error:
         raise InputError(f"start_from: {error}") from error
     own = _named(model)
-    # Ranges are of the integer version, which is calibrated after the training.
-    tensors = {key: tensor for key, tensor in _named(other).items() if not key.endswith(".ranges")}
+    tensors = _named(other)
     if not tensors:
         raise InputError(f"start_from: expected a model with weights, found '{name}'")
     for key, tensor in tensors.items():
@@ -335,7 +333,7 @@ def save_weights(model: Model, architecture: str, settings: dict[str, Any], abou
 
 
 def _named(model: Model) -> dict[str, Tensor]:
-    """The weights of a model by name, and the ranges of its calibrated U-Nets.
+    """The weights of a model by name.
 
     Names do not include wrappers, so that a file fits the model with and without them.
     """
@@ -344,12 +342,7 @@ def _named(model: Model) -> dict[str, Tensor]:
     own = {_bare(key): value for key, value in model.state_dict().items()}
     if len(own) < len(model.state_dict()):
         raise InputError("model: expected weights that differ by name without 'inner', found two of one name")
-    return own | {f"{name}.ranges": unet.ranges for name, unet in _unets(model).items() if unet.ranges is not None}
-
-
-def _unets(model: Model) -> dict[str, UNet]:
-    modules = model.named_modules() if isinstance(model, nn.Module) else ()
-    return {_bare(name): module for name, module in modules if isinstance(module, UNet)}
+    return own
 
 
 def _bare(key: str) -> str:

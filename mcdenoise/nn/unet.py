@@ -9,9 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, is_cpu_inference, layout_of, max_pool
-from mcdenoise.nn.int8 import Int8UNet, measure, wants_integers
-from mcdenoise.ops._window import computing_dtype, corner
+from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, layout_of, max_pool
+from mcdenoise.ops._window import corner
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
@@ -56,9 +55,6 @@ class UNet(nn.Module):
         upwards = list(itertools.pairwise(self.widths[::-1]))
         self.up = nn.ModuleList(Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
         self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
-        # Ranges of the tensors of a calibrated U-Net, and its integer version.
-        self.ranges: Tensor | None = None
-        self._integers: Int8UNet | None = None
 
     def level(self, scale: int) -> int:
         """The level that holds the features of a scale."""
@@ -96,11 +92,7 @@ class UNet(nn.Module):
         height, width = x.shape[-2:]
         # Sizes are rounded up to multiples, so that halves are simple expressions in a graph for any image size.
         x = self._whole(x)
-        if self._integers is not None and wants_integers() and is_cpu_inference(x):
-            dtype = computing_dtype(x)
-            features = self._integers(x, self._beside(x, coarse), self.level(self.scales - 1) + 1, dtype)
-        else:
-            features = self._features(x, coarse)
+        features = self._features(x, coarse)
         found = []
         for scale in range(self.scales):
             level = self.level(scale)
@@ -125,34 +117,9 @@ class UNet(nn.Module):
             features.append(x)
         return features[::-1]
 
-    @torch.no_grad()
-    def calibrate(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> None:
-        """Extend the ranges of the tensors by those for one more input; arguments as for :meth:`forward`."""
-        x = self._whole(x.float())
-        found = measure(self.encoder, self.up, self.decoder, x, [given.float() for given in self._beside(x, coarse)])
-        if self.ranges is not None:
-            low, high = torch.stack([self.ranges, found]).unbind(-1)
-            found = torch.stack([low.amin(0), high.amax(0)], -1)
-        self.ranges = found
-
-    def quantize(self) -> None:
-        """Prepare for computing in integers with the current weights, see :func:`mcdenoise.nn.int8.integers`.
-
-        Raises:
-            ValueError: the U-Net is not calibrated, or has the ranges of another network.
-        """
-        if self.ranges is None:
-            raise ValueError("ranges: expected a calibrated U-Net, found one that is not")
-        self._integers = Int8UNet(self.encoder, self.up, self.decoder, self.ranges)
-
     def _whole(self, x: Tensor) -> Tensor:
         """Pad to whole pixels of the coarsest level."""
         return _padded(x, [(side + self.multiple - 1) // self.multiple * self.multiple for side in x.shape[-2:]])
-
-    def _beside(self, x: Tensor, coarse: Sequence[Tensor]) -> list[Tensor]:
-        """Pad the additional inputs in the same way; not in a graph, which derives sizes from tensors only."""
-        sizes = ([side // (self.stride << level) for side in x.shape[-2:]] for level in range(1, self.levels))
-        return [_padded(given, size) for given, size in zip(coarse, sizes, strict=False)]
 
 
 class Head(nn.Conv2d):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from mcdenoise.errors import InputError
-from mcdenoise.models import DEFAULT, FloatPrecision
+from mcdenoise.models import DEFAULT, Precision
 from mcdenoise.train.losses import Loss
 
 Schedule = Literal["constant", "cosine"]
@@ -93,7 +93,7 @@ class TrainConfig:
     tint: float = 0.0
     gloss: float = 0.0
     exact_features: bool = False
-    precision: FloatPrecision = "float32"
+    precision: Precision = "float32"
     seed: int = 0
 
     @property
@@ -152,7 +152,7 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     for name, low in lowest.items():
         if not settings[name] >= low:
             raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
-    choices = {"loss": get_args(Loss), "schedule": get_args(Schedule), "precision": get_args(FloatPrecision)}
+    choices = {"loss": get_args(Loss), "schedule": get_args(Schedule), "precision": get_args(Precision)}
     for name, known in choices.items():
         if settings[name] not in known:
             raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")

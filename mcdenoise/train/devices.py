@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from mcdenoise.errors import InputError
-from mcdenoise.models import FloatPrecision
+from mcdenoise.models import Precision
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -17,7 +17,7 @@ def is_first_process() -> bool:
     return not _launched() or os.environ["RANK"] == "0"
 
 
-def open_fabric(accelerator: str, precision: FloatPrecision, batch: int) -> Fabric:
+def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
     """Connect this process with the other processes of its run: one device each, on one or several machines.
 
     Args:

@@ -84,11 +84,6 @@ def weights(folder: Path, _: str) -> object:
     return tensors(folder / f"run/{MODEL}.safetensors")
 
 
-def calibrated(folder: Path, _: str) -> object:
-    """Checksum of the tensors and the ranges."""
-    return tensors(folder / "out.safetensors")
-
-
 def tensors(path: Path) -> object:
     from safetensors import safe_open
 
@@ -169,9 +164,6 @@ COMMANDS = {
     "models": Command("models --results results", ("results",), printed),
     "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
     "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
-    "calibrate": Command(
-        "calibrate weights.safetensors shot -o out.safetensors", ("shot", "weights.safetensors"), calibrated
-    ),
     # If methods fail, the benchmark lists the reasons and ends with status 1.
     "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
     "export": Command(
@@ -382,7 +374,6 @@ KINDS = {
             "reader exr": 100,
             "train": 8,
             "benchmark": 12,
-            "calibrate": 12,
         },
     ),
     "color of the second frame": Kind(
@@ -403,9 +394,7 @@ KINDS = {
     "camera_matrices.h": Kind(
         "shot/inputs/camera_matrices.h", anything, {"denoise": 100, "inspect": 60, "reader camera_matrices": 160}
     ),
-    "weights": Kind(
-        "weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30, "calibrate": 30}
-    ),
+    "weights": Kind("weights.safetensors", exactly, {"denoise network": 120, "reader weights": 160, "export": 30}),
     "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), {"denoise hdr": 60, "reader hdr": 60}),
     "pfm": Kind("still.pfm", partial(pixels, suffix=".pfm"), {"denoise pfm": 60}),
     "tif": Kind("still.tif", partial(pixels, suffix=".tif"), {"denoise tif": 60}),

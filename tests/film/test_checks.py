@@ -39,7 +39,6 @@ def run(shot: Path, out: Path) -> FilmResult:
         'weights = "nowhere.safetensors"',
         'model = "noisy"\nalpha_min = 0.5',
         'device = "gpu"',
-        'model = "noisy"\nprecision = "int8"',
         "tile = 33",
         'budget_ms = 5.0\nresults = "nowhere"',
         "max_error = nan",

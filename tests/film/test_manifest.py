@@ -113,7 +113,7 @@ SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
         (SHOT + "alpha = 1", "alpha: expected true or false, found 1"),
         (SHOT + "model = 3", "model: expected a text, found 3"),
         (SHOT + "weights = 3", "weights: expected a path, found 3"),
-        (SHOT + "precision = 'exact'", "precision: expected one of auto, float32, bfloat16, int8, found 'exact'"),
+        (SHOT + "precision = 'exact'", "precision: expected one of auto, float32, bfloat16, found 'exact'"),
         (SHOT + "map = [1]", "map: expected a text or a list of texts, found [1]"),
         (SHOT + "frames = '3-1'", "shot 1 'a': frames: expected numbers and ascending ranges"),
         (SHOT + "budget_ms = 5.0\nmodel = 'noisy'", "expected no --model or --weights: they choose it"),
