@@ -48,7 +48,6 @@ from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._spilled import drop_pages, spilled
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
@@ -346,8 +345,6 @@ class Denoiser:
         size, buffers, layers = self._size, self._buffers, self._expected_layers
         # A single frame has no next one to read.
         self.has_room_ahead = size is not None and self._frames != 1 and self.model is not None
-        # Whether frames are best handed over in files, because they do not fit into the memory beside their history.
-        self.spills = False
         if buffers is not None and size is not None and self.model is not None:
             streaming = self.has_history(buffers)
             # One more for the remainder.
@@ -355,9 +352,7 @@ class Denoiser:
             size = (size[0], size[1] + 2 * seam(size[1])) if self.wrap else size
             shot = Frames(size, frozenset(buffers) - (frozenset() if streaming else MOTION), streaming, carried=carried)
             shot = shot._replace(bfloat16=self.precision != "float32")
-            with torch.set_grad_enabled(self.differentiable):
-                self.spills = self._tiles.spills(shot)
-                self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
+            self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     @property
     @_in_turn
@@ -453,9 +448,6 @@ class Denoiser:
                 report.missing = absent_buffers(self.model, frame)
                 precision, report.tiles = self._planned(frame, report)
                 before, seen = self._continued(frame, report)
-                # Repaired buffers are in memory again.
-                frame = frame.map(spilled) if self.spills else frame
-                drop_pages()
             noisy = frame.color
             computing = computing_in(precision, self.device)
             with computing, self._explained(dtype), timed(self._name, self.device):
@@ -500,9 +492,9 @@ class Denoiser:
         """The state that a frame continues, and its pixels to compare the next one with.
 
         Where it repeats the noise of the frame before, it takes that frame's place in the history: equal noise counts
-        once. On a GPU, which is not read, with ``keep_all``, and for a history in files this is not looked for.
+        once. On a GPU, which is not read, and with ``keep_all`` this is not looked for.
         """
-        watches = at_hand(self.device) and self.has_history(frame.buffers) and not (self.spills or self.keep_all)
+        watches = at_hand(self.device) and self.has_history(frame.buffers) and not self.keep_all
         seen = thinned(frame) if watches else None
         if seen is None or self._seen is None or not noise_is_repeated(frame, seen, self._seen):
             # Before a network runs, so that it has the memory.

@@ -26,7 +26,6 @@ from mcdenoise.denoiser import Denoiser, FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
-from mcdenoise.models._spilled import spilled
 
 # Largest fraction of pixels without a history, and smallest correlation of two images of the same place.
 _MOST, _ALIKE = 0.5, 0.9
@@ -343,8 +342,7 @@ def _read_frames(
         on_read(number)
         frame = sequence.frame(number, reference=reference, buffers=wanted)
         # Depth may be computed from the positions.
-        frame = frame if streaming else frame.with_depth().without_history()
-        return frame.map(spilled) if denoiser.spills else frame, _since(start)
+        return frame if streaming else frame.with_depth().without_history(), _since(start)
 
     with ThreadPoolExecutor(1) as reader:
         # Keep no reference to a frame here, so that the caller can free it.

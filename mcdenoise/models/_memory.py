@@ -12,9 +12,7 @@ import torch
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
 from mcdenoise.models._interface import Model
-from mcdenoise.models._spilled import CAN_SPILL
 from mcdenoise.models._wrapper import parts_of
-from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.tiled import Region, Tiled
 
 GB = 1e9
@@ -40,8 +38,6 @@ _KEPT = 10
 _PER_CARRIED = 56
 # Buffers of a frame that are kept beside them.
 _SURFACE = ("position", "normal", "depth")
-# Channels in memory where frames and history are in files, measured: while a network runs, and while none does.
-_IN_MEMORY, _IN_MEMORY_ELSEWHERE = 11, 15
 _STATM = Path("/proc/self/statm")
 
 
@@ -75,8 +71,6 @@ class Division:
         self._memory = check_limits(side, max_memory, device)
         if not self._tiled and (side, max_memory) != (None, None):
             raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
-        # Methods with a history of another kind keep it in memory.
-        self._accumulated = parts_of(model, Accumulated)
         self._side = side
         self._tilings: dict[Frames, Tiling] = {}
 
@@ -88,18 +82,10 @@ class Division:
         """
         if not self._tiled:
             return "whole frames: the model computes no tiles"
-        frames = frames._replace(spilled=self.spills(frames))
-        for accumulated in self._accumulated:
-            accumulated.spill(frames.spilled)
         tiling = self._tiling(frames)
         for tiled in self._tiled:
             tiled.side = tiling.side
-        return f"{tiling.reason}; the history is in a file" if frames.spilled else tiling.reason
-
-    def spills(self, frames: Frames) -> bool:
-        """Whether frames and their history have to be kept in files."""
-        possible = CAN_SPILL and bool(self._tiled and self._accumulated) and not torch.is_grad_enabled()
-        return possible and frames.streaming and self._memory.is_short(frames, self._network(frames))
+        return tiling.reason
 
     def has_room_ahead(self, frames: Frames) -> bool:
         """Whether the next frame can be read, and the last one be written, while one is denoised.
@@ -109,9 +95,6 @@ class Division:
         """
         if not self._tiled:
             return True
-        if self.spills(frames):
-            self._tiling(frames._replace(spilled=True))
-            return False
         self._tiling(frames)
         return self._memory.has_room_ahead(frames, self._network(frames))
 
@@ -152,10 +135,6 @@ class Memory:
     def has_room_ahead(self, frames: Frames, network: Network) -> bool:
         """Whether the next frame can be read, and the last one be written, beside tiles that are not too small."""
         return self.cap is None or self._least(frames._replace(ahead=True), network, _WORTHWHILE_SIDE) <= self.cap
-
-    def is_short(self, frames: Frames, network: Network) -> bool:
-        """Whether not even the smallest tiles fit, on a CPU."""
-        return self.cap is not None and self._device.type == "cpu" and self._least(frames, network) > self.cap
 
     def choose(self, frames: Frames, network: Network) -> Tiling:
         """The largest tiles that fit.
@@ -220,8 +199,7 @@ class Frames(NamedTuple):
         ahead: the next frame is read, and the last one written, at the same time.
         batch: number of images.
         carried: number of layers, with the rest that is in none of them, and of denoised alphas.
-        spilled: frames and history are in files, see :mod:`mcdenoise.models._spilled`.
-        bfloat16: convolutions are in bfloat16, or in integers.
+        bfloat16: convolutions are in bfloat16.
     """
 
     size: tuple[int, int]
@@ -230,14 +208,11 @@ class Frames(NamedTuple):
     ahead: bool = False
     batch: int = 1
     carried: int = 0
-    spilled: bool = False
     bfloat16: bool = False
 
     @property
     def held(self) -> int:
         """Bytes of whole images while a network runs."""
-        if self.spilled:
-            return self._bytes(_IN_MEMORY)
         # Demodulated color; its history and that of the frame before, to which a failure returns; the results of both
         # networks.
         kept = 2 * (_KEPT + self._channels(*_SURFACE)) if self.streaming else 1
@@ -246,8 +221,6 @@ class Frames(NamedTuple):
     @property
     def held_elsewhere(self) -> int:
         """Bytes of whole images, at most, while none runs."""
-        if self.spilled:
-            return self._bytes(_IN_MEMORY_ELSEWHERE)
         # One of the results is kept in other units, too.
         kept = _KEPT + self._channels(*_SURFACE) if self.streaming else 1
         after = self._channels() + 3 + kept + 9

@@ -17,9 +17,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._journal import Journal, ask, journal, note, tell_history, timed
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._spilled import spilled
 from mcdenoise.models._state import ADVICE, own_pair, own_state
-from mcdenoise.models._windows import blend_in_windows, first_in_file
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface, motion_from_position
 from mcdenoise.ops._steps.history import (
@@ -153,7 +151,6 @@ class Accumulated(Wrapper):
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
         self.clamp_current, self.also = clamp_current, tuple(also)
-        self._spills = False
 
     @property
     def needs(self) -> Needs:
@@ -162,10 +159,6 @@ class Accumulated(Wrapper):
         given = frozenset({"current", "length", ALBEDO_HISTORY})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
-
-    def spill(self, spills: bool) -> None:
-        """Keep the history in files (see :mod:`mcdenoise.models._spilled`), or in memory: it changes no setting."""
-        self._spills = spills
 
     @property
     def persistence(self) -> float:
@@ -207,7 +200,6 @@ class Accumulated(Wrapper):
         if blind and not reset:
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
         entering = incoming(frame.color, None, limit, compared=compared)
-        entering = spilled(entering) if self._spills else entering
         seen = lights(entering[:, MEAN]) if compared else None
         carried: _Carried = ()
         still: bool | Tensor = False
@@ -235,7 +227,7 @@ class Accumulated(Wrapper):
                 if not torch.equal(chosen, limit):
                     limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
         if reset:
-            color = first_in_file(entering) if self._spills else without_history(entering)
+            color = without_history(entering)
             length = torch.ones_like(entering[:, :1])
             carried = self._first(frame, entering)
             inner, still = None, False
@@ -244,13 +236,10 @@ class Accumulated(Wrapper):
             self._report(found, frame, reset, still=still_for_sure, can_move=can_move, keeps=keeps)
         after = None
         current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
-        if self._spills:
-            color, length, current = spilled(color), spilled(length), spilled(current)
         del entering
         if keeps:
             # In most frames no light is seen, and all labels are 0.
             label = seen if seen is None or (not blind and not seen.any()) else seen * _steady(color)
-            label = spilled(label) if self._spills and label is not None else label
             surface = Surface(frame.position, frame.normal, frame.depth, label)
             after = History(color, length, surface, frame.view_projection, limit, carried)
         hints = frame.hints._replace(still=still_for_sure)
@@ -300,8 +289,7 @@ class Accumulated(Wrapper):
         surface, previous = surface_before(frame)._replace(label=seen), history.surface
         if self.rule == "relative":
             surface, previous = comparable(surface, previous)
-        blended = blend_in_windows if self._spills else blend
-        return blended(
+        return blend(
             *(entering, before, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
             rule=self.rule,

@@ -8,7 +8,6 @@ from torch import Tensor
 from mcdenoise.frame import BUFFERS, Frame, Skip
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._spilled import drop_pages
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.ops import downsample
@@ -68,7 +67,6 @@ def _halved(frame: Frame) -> Frame:
     for name, image in frame.items():
         if name in _IMAGES:
             images[name] = downsample(image)
-            drop_pages()
     others = dict.fromkeys(frame.buffers - images.keys() - frame.extra.keys())
     skip = None if frame.skip is None else Skip(_halved_mask(frame.skip.mask), {})
     return frame.replace(**(others | images), extra={}, skip=skip)

@@ -14,7 +14,6 @@ from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._interface import Model, Output, State, prepared
 from mcdenoise.models._journal import note
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._spilled import drop_pages
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops._window import mirrored
 
@@ -80,7 +79,6 @@ class Tiled(Wrapper):
         frame = frame if frame.statistics else prepared(self.inner, frame)
         results: dict[str, Tensor] = {}
         halo = self.halo or 0
-        drop_pages()
         for part in parts:
             around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
             output, after = self._within(around, frame)
@@ -92,7 +90,6 @@ class Tiled(Wrapper):
                 if name not in results:
                     results[name] = _known(frame, name).to(image.dtype, copy=True)
                 kept.of(results[name]).copy_(kept.within(around).of(image))
-            drop_pages()
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         image = results.pop("image") if results else _known(frame, "image")
