@@ -23,7 +23,7 @@ os.environ["MCDENOISE_PRECISION"] = "float32"
 # Models that differ from the smallest of their family by their sizes, in tests of every model: those show as much.
 LARGER = (
     *("cascaded_v2_small", "cascaded_v2_tiny", "cascaded_v3", "cascaded_v3_small", "cascaded_v3_tiny"),
-    *("oidn_tuned", "oidn_tuned_exact", "pyramid", "pyramid_small"),
+    *("oidn_tuned", "oidn_tuned_exact"),
 )
 OF_EVERY_MODEL = ("bad_input", "defaults", "device_reads", "export", "layers", "models", "pieces")
 

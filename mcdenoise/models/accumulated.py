@@ -46,7 +46,6 @@ _LOST, CAUSTICS = 0.1, 120.0
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 # A light is steady if its compressed radiance varied by less than this fraction over the history.
 _STEADY = 0.1
-ALBEDO_HISTORY = "albedo_history"
 _NO_WAY = "no motion, and no position with a previous camera"
 
 
@@ -121,8 +120,7 @@ class Accumulated(Wrapper):
         clamp_current: whether fireflies are also clamped in ``current``.
         also: names of further buffers to accumulate with the weights of the color, where a frame has them: buffers
             ``(B, 3, H, W)`` of ``frame.extra``, whose fireflies are kept; or ``"diffuse"`` and ``"specular"``, which
-            the method sees accumulated. With ``"albedo"``, the method finds the history of the albedo, anti-aliased by
-            all its frames, as ``albedo_history`` in ``frame.extra``.
+            the method sees accumulated.
 
     Raises:
         InputError: a setting is out of its range.
@@ -156,7 +154,7 @@ class Accumulated(Wrapper):
     def needs(self) -> Needs:
         """The needs of the method inside, except for the buffers made here; buffers that tell motion are of use."""
         needs = self.inner.needs
-        given = frozenset({"current", "length", ALBEDO_HISTORY})
+        given = frozenset({"current", "length"})
         uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
         return Needs(needs.buffers - given, uses, needs.trainable, None)
 
@@ -322,7 +320,7 @@ class Accumulated(Wrapper):
         layers = {name: part[:, COLOR] for name, part in found[: len(frame.layers)]}
         rest = found[len(frame.layers) :]
         alpha = frame.alpha if alpha is None else rest.pop(0)[1][:, :1]
-        also = {ALBEDO_HISTORY if name == "albedo" else name: part[:, COLOR] for name, part in rest}
+        also = {name: part[:, COLOR] for name, part in rest}
         own = {name: also.pop(name) for name in RADIANCE if name in also}
         return frame.replace(layers=layers, alpha=alpha, extra={**frame.extra, **also}, **own)
 

@@ -5,12 +5,7 @@ the public code for the BMFR data: six 5x5 convolutions of 14 channels without b
 12 output channels: six importance maps for kernels of sides 3, 5, 7, 9, 11, 13 at one scale, and six blending weights,
 which are normalized by a softmax.
 
-Fan's paper describes a U-Net that predicts at several scales instead. This is `wskp_unet`, as far as it is known: by
-the comparison of doi:10.1007/s00371-023-02951-6 it has the backbone of `mrkp`, and at each scale three maps for kernels
-of sides 3, 5 and 7. The rest is our guess: three scales, at each of which the kernels are blended as above, by a
-softmax of three more maps; scales blended as in `mrkp`, by one more channel behind a ReLU, with the coarsest
-unfiltered; and a backbone of ordinary convolutions, as wide as that of `mrkp`. Neither its sizes nor its weights are
-public.
+Fan's paper describes a U-Net that predicts at several scales instead; neither its sizes nor its weights are public.
 
 Each convolution is trained as the sum of a 5x5, a 3x3 and a 1x1 convolution and, except for the first and last, the
 identity (RepVGG, Ding et al. 2021). These are merged into one 5x5 kernel before it is applied, also in training: result
@@ -38,12 +33,10 @@ from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.exposed import Exposed
-from mcdenoise.models.mrkp import SCALES, Backbone, blend_scales, reach_of, scales_of, with_glorot
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import importance_filter
 
 SIDES = (3, 5, 7, 9, 11, 13)
-SIDES_OF_SCALE = (3, 5, 7)
 _SLOPE = 0.1
 
 
@@ -114,37 +107,6 @@ class WskpNetwork(TenChannels):
         return answered(frame, filtered(with_carried(frame), *self.maps(frame), SIDES)), None
 
 
-class WskpUNet(TenChannels):
-    """Predicts importance maps and blending weights at three scales, filters each, and blends from coarse to fine.
-
-    Args:
-        width: channels of every convolution, 48.
-    """
-
-    def __init__(self, width: int = 48) -> None:
-        super().__init__()
-        self.unet, self.kernels = Backbone(10, width), len(SIDES_OF_SCALE)
-        self.heads = nn.ModuleList(
-            with_glorot(nn.Conv2d(self.unet.out_channels, 2 * self.kernels + 1, 3, padding=1)) for _ in range(SCALES)
-        )
-
-    @property
-    def needs(self) -> Needs:
-        """See :func:`mcdenoise.models.mrkp.reach_of`."""
-        reach = reach_of(max(SIDES_OF_SCALE) // 2)
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
-
-    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        """See :class:`mcdenoise.models.Model`."""
-        levels = self.unet(self.input_of(frame, displayed(frame)))
-        *scales, result = scales_of(with_carried(frame))
-        for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
-            importance, blend, alpha = head(level).split([self.kernels, self.kernels, 1], 1)
-            d = filtered(n, importance, torch.softmax(blend, 1), SIDES_OF_SCALE)
-            result = blend_scales(d, result, F.relu(alpha).to(n.dtype))
-        return answered(frame, result.clamp_min(0)), None
-
-
 def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[int]) -> Tensor:
     """Blend the filters given by importance maps, ``sum_i blend_i box_i(exp(m_i) c) / box_i(exp(m_i))``.
 
@@ -184,27 +146,3 @@ def wskp(
         InputError: there are fewer than two layers.
     """
     return as_published(Exposed(Tiled(WskpNetwork(width, layers))), alpha_min, position_limit, normal_limit)
-
-
-@register_model(
-    "wskp_unet",
-    "kernels of shared weights at three scales of a U-Net, partly guessed",
-    kind="kernel",
-    paper="Fan et al. 2021",
-)
-def wskp_unet(
-    width: int = 48,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
-    """Kernel prediction with shared weights at several scales, behind the published accumulation.
-
-    Args:
-        width: channels of every convolution.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
-    """
-    return as_published(Exposed(Tiled(WskpUNet(width))), alpha_min, position_limit, normal_limit)

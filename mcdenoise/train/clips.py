@@ -13,7 +13,6 @@ from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Frame, Hints
-from mcdenoise.models.accumulated import ALBEDO_HISTORY
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate
@@ -24,7 +23,7 @@ _KNOWN = frozenset(field.name for field in fields(Frame))
 
 # Buffers of radiance, of reflectance, and of world-space vectors, whose channels can be permuted.
 LIGHT = frozenset({*RADIANCE, "reference", NOISY, OIDN, OIDN_CLEAN})
-_COLORED = LIGHT | {"albedo", OIDN_ALBEDO, ALBEDO_HISTORY, "specular_albedo", "variance"}
+_COLORED = LIGHT | {"albedo", OIDN_ALBEDO, "specular_albedo", "variance"}
 _WORLD = frozenset({"normal", "position", "previous_position"})
 
 
@@ -188,7 +187,7 @@ class ClipSampler:
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         light = demodulate(radiance, albedo) if demodulated else radiance
         painted = {name: light for name in ("color", "current")}
-        painted |= {"albedo": albedo, ALBEDO_HISTORY: albedo, "normal": normal, "reference": radiance}
+        painted |= {"albedo": albedo, "normal": normal, "reference": radiance}
         # Depth, motion and history are not changed: the lamp lies on the surface. It has no albedo and no noise.
         painted |= dict.fromkeys(("emission", NOISY, OIDN, OIDN_CLEAN), radiance)
         painted |= dict.fromkeys(("diffuse", "specular", "variance"), torch.zeros(1, 3, 1, 1))

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Clamped, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
-from mcdenoise.models.accumulated import ALBEDO_HISTORY, CAUSTICS
+from mcdenoise.models.accumulated import CAUSTICS
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
@@ -45,11 +45,8 @@ class Front:
     @property
     def parts(self) -> dict[str, int]:
         """Names and channels of the buffers that depend on the noise seed: radiance, and histories."""
-        also = {name for _, settings in self.wrappers for name in settings.get("also", ())}
-        history = {ALBEDO_HISTORY: 3} if "albedo" in also else {}
-        history |= dict.fromkeys(self.given, 3)
         accumulated = ACCUMULATED if self.accumulates else {"color": 3}
-        return {**accumulated, **history, **(GIVEN if self._has(WithOidn) else {})}
+        return {**accumulated, **dict.fromkeys(self.given, 3), **(GIVEN if self._has(WithOidn) else {})}
 
     def of(self, buffers: Collection[str]) -> Front:
         """The same front for frames that all have these buffers."""

@@ -44,8 +44,6 @@ from mcdenoise.models import (
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8
 MODELS = list_models()
-# Of those there are no weights: random ones make no image.
-UNTRAINED = [name for name in MODELS if name.startswith("pyramid") or name == "wskp_unet"]
 DIFFERENTIABLE: dict[str, dict[str, Any]] = {"oidn_temporal": {"engine": "torch"}}
 FAMILY = ["cascaded_v2", "cascaded_v2_micro", "cascaded_v2_small", "cascaded_v2_tiny"]
 SIZES = [(1, 1), (5, 7), (17, 33)]
@@ -316,7 +314,7 @@ def even(height: int, width: int, model: Any) -> Frame:
     return frame.replace(**given)
 
 
-@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn", *UNTRAINED}))
+@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn"}))
 @torch.no_grad()
 def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
     """Up to its borders: it varies by little more than far from them, and has the level that it has there."""

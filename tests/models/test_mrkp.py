@@ -147,7 +147,7 @@ def test_tiles_give_the_image(name: str) -> None:
     torch.testing.assert_close(tiled, whole)
 
 
-@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp", "wskp_unet"])
+@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp"])
 def test_its_wrappers_and_their_settings(name: str) -> None:
     """The published accumulation with alpha 0.2, on demodulated radiance."""
     model = create_model(name)
@@ -158,7 +158,7 @@ def test_its_wrappers_and_their_settings(name: str) -> None:
     assert (accumulated.position_limit, accumulated.normal_limit) == (0.01, 1.0)
 
 
-@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp", "wskp_unet"])
+@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp"])
 @torch.no_grad()
 def test_a_constant_image_is_kept(name: str) -> None:
     """Weights have the sum 1, but for 1e-8, and scales agree."""

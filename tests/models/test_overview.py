@@ -33,7 +33,6 @@ def test_lists_every_model_by_kind_and_name() -> None:
     tiny = by_name["cascaded_v2_tiny"]
     assert (tiny.kind, tiny.weights) == ("kernel", "shipped")
     assert (by_name["cascaded"].weights, by_name["svgf"].paper) == ("compared", "Schied et al. 2017")
-    assert by_name["wskp_unet"].weights == "to train"
     # Multiply-adds are no fewer than a sixteenth of the weights, of which each is used once in 4x4 pixels or more.
     assert tiny.kmacs_per_pixel is not None
     assert tiny.kmacs_per_pixel > tiny.parameters / 64 / 1e3

@@ -168,7 +168,6 @@ def test_it_starts_with_the_weights_of_the_family_before() -> None:
     ("name", "found"),
     [
         ("nothing", "model 'nothing': expected one of"),
-        ("pyramid", "expected shipped weights"),
         ("guided", "expected a model with weights, found 'guided'"),
         ("cascaded_v2", "expected layer"),
     ],

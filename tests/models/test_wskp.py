@@ -8,15 +8,13 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from test_cascaded import frame_of_doubles, halved
-from test_mrkp import copied, features
+from test_cascaded import frame_of_doubles
 from torch import Tensor, nn
 from toys import refused
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Tiled, create_model, parts_of
-from mcdenoise.models.mrkp import Backbone
-from mcdenoise.models.wskp import Reparameterized, WskpNetwork, WskpUNet
+from mcdenoise.models.wskp import Reparameterized, WskpNetwork
 
 SIZE = (5, 6)
 
@@ -109,36 +107,8 @@ def test_it_is_its_equations() -> None:
 
 
 @torch.no_grad()
-def test_the_unet_is_its_equations() -> None:
-    network, frame = drawn(WskpUNet(4)), bright_frame()
-    for head in network.heads:
-        head.bias[-1] += 1  # lest the ReLU hides the coarser scales
-    levels = features(network.unet, seen(frame))
-    scales = [frame.color, halved(frame.color), halved(halved(frame.color))]
-    out = halved(scales[-1])
-    for n, level, head in zip(scales[::-1], levels[::-1], list(network.heads)[::-1], strict=True):
-        predicted = F.conv2d(level, head.weight, head.bias, padding=1)
-        d, alpha = filtered(n, predicted[:, :6], (1, 2, 3)), predicted[:, 6:].clamp_min(0)
-        assert (alpha > 0).any()
-        size = n.shape[-2:]
-        out = d - alpha * copied(halved(d), *size) + alpha * copied(out, *size)
-    torch.testing.assert_close(network(frame)[0].image, out.clamp_min(0))
-
-
-def test_the_unet_has_the_backbone_of_mrkp_and_seven_channels_a_scale() -> None:
-    network = next(parts_of(create_model("wskp_unet"), Tiled)).inner
-    assert isinstance(network, WskpUNet)
-    assert isinstance(network.unet, Backbone)
-    backbone, heads = (sum(p.numel() for p in part.parameters()) for part in (network.unet, network.heads))
-    # The backbone is that of MRKP without its three heads of 26 channels.
-    assert backbone == 341_838 - 3 * (96 * 9 + 1) * 26
-    assert heads == 3 * (96 * 9 + 1) * 7
-
-
-@pytest.mark.parametrize(("network", "width"), [(WskpNetwork(4, 4), 100), (WskpUNet(4), 480)], ids=["wskp", "unet"])
-@torch.no_grad()
-def test_tiles_give_the_image(network: nn.Module, width: int) -> None:
-    network, frame = drawn(network), frame_of_doubles(9, width)
+def test_tiles_give_the_image() -> None:
+    network, frame = drawn(WskpNetwork(4, 4)), frame_of_doubles(9, 100)
     frame = frame.replace(statistics=network.statistics(frame))
     torch.testing.assert_close(Tiled(network, side=32)(frame)[0].image, network(frame)[0].image)
 
