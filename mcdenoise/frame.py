@@ -66,9 +66,6 @@ BUFFERS: dict[str, BufferSpec] = {
     "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by specular reflection"),
     "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0, forgiven=True),
     "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
-    "hit_distance": BufferSpec(
-        1, 0.0, _UNBOUNDED, "length of the first bounce, scene units; inf where it hit nothing", infinite=True
-    ),
     "emission": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance sent out by the surface itself, without noise"),
     "variance": BufferSpec(3, 0.0, _UNBOUNDED, "variance of the mean that color is, of each channel"),
     "alpha": BufferSpec(1, 0.0, 1.0, "coverage: 0 where only background is seen"),
@@ -164,8 +161,6 @@ class Frame:
         specular: ``(B, 3, H, W)`` noisy radiance by specular reflection.
         specular_albedo: ``(B, 3, H, W)`` specular reflectance in [0, 1].
         roughness: ``(B, 1, H, W)`` in [0, 1]; 0 is a mirror.
-        hit_distance: ``(B, 1, H, W)`` length of the first bounce in scene units; for methods of your own: no method
-            of the package reads it.
         emission: ``(B, 3, H, W)`` radiance of the surface itself, without noise.
         variance: ``(B, 3, H, W)`` variance of ``color`` as a mean of samples.
         alpha: ``(B, 1, H, W)`` coverage in [0, 1].
@@ -209,7 +204,6 @@ class Frame:
     specular: Tensor | None = None
     specular_albedo: Tensor | None = None
     roughness: Tensor | None = None
-    hit_distance: Tensor | None = None
     emission: Tensor | None = None
     variance: Tensor | None = None
     alpha: Tensor | None = None

@@ -512,7 +512,7 @@ def test_a_method_that_fails_gives_exit_status_1(small_sequence: Path, out: Path
 
 
 def demanding() -> Any:
-    return lambda color, hit_distance: color
+    return lambda color, roughness: color
 
 
 def test_a_method_is_skipped_on_scenes_that_lack_its_buffers(

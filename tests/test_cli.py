@@ -297,7 +297,7 @@ def smaller():
     return lambda color: color[..., 1:]
 
 def demanding():
-    return lambda color, hit_distance: color
+    return lambda color, roughness: color
 
 def nothing():
     return 3
@@ -361,7 +361,7 @@ def test_a_users_model_that_is_not_available(
     [
         ("infinite", "frame 0: model: expected finite radiance, found 480 NaN or infinite pixels"),
         ("smaller", "frame 0: model: expected an Output with an image of (1, 3, 20, 24), found an image of"),
-        ("demanding", "frame 0: buffer 'hit_distance': the model needs it"),
+        ("demanding", "frame 0: buffer 'roughness': the model needs it"),
     ],
 )
 def test_a_bad_result_is_not_written(

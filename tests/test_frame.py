@@ -88,7 +88,6 @@ def test_depth_may_be_infinite() -> None:
     ("name", "bad"),
     [
         ("roughness", NAN),
-        ("hit_distance", -INF),
         ("variance", INF),
         ("albedo", NAN),
         ("albedo", INF),

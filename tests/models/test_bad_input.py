@@ -98,12 +98,12 @@ def test_methods_that_would_do_are_found_without_drawing_numbers() -> None:
 
 
 def test_a_function_of_buffers_says_which_it_takes() -> None:
-    def mine(color: Tensor, hit_distance: Tensor, roughness: Tensor | None = None) -> Tensor:
-        return color * hit_distance
+    def mine(color: Tensor, emission: Tensor, roughness: Tensor | None = None) -> Tensor:
+        return color * emission
 
     message = refused(lambda: as_model(mine)(Frame(torch.rand(1, 3, 4, 5))))
     assert message == (
-        "buffer 'hit_distance': mine takes it, found only color; render it, or give that argument a default value"
+        "buffer 'emission': mine takes it, found only color; render it, or give that argument a default value"
     )
 
 

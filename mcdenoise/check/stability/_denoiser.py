@@ -143,7 +143,6 @@ def _shots(dtype: torch.dtype) -> dict[str, list[Frame]]:
     shots |= {"mask 0 in some rows": [frame.replace(mask=void) for frame in frames]}
     shots |= {"void rows": [frame.replace(color=frame.color * void, alpha=void) for frame in frames]}
     shots |= {"albedo 93 in some rows": with_value("albedo", 93.0, some)}
-    shots |= {"hit distance 0": [frame.replace(hit_distance=0 * frame.color[:, :1]) for frame in frames]}
     shots |= {"normal -1": with_value("normal", -1.0)}
     shots |= {"albedo without normal": [frame.replace(normal=None) for frame in frames]}
     shots |= {"normal without albedo": [frame.replace(albedo=None) for frame in frames]}
