@@ -29,25 +29,24 @@ from mcdenoise.models import (
     DEFAULT,
     EXACT,
     FILTERED,
-    Journal,
     Model,
+    Note,
     Output,
+    Report,
     State,
     computing_in,
     create_model,
     fastest_precision,
     find_model,
     has_network,
-    listening,
-    timed,
 )
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
-from mcdenoise.models._journal import ask
 from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models._times import Times
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
@@ -99,7 +98,7 @@ if hasattr(os, "register_at_fork"):
 
 
 @dataclass
-class FrameReport(Journal):
+class FrameReport(Report):
     """Report of one frame.
 
     Args:
@@ -238,7 +237,7 @@ class Denoiser:
         self._asked, self._given, self._limits = precision, settings, (tile, max_memory)
         if model is None and weights is not None:
             model = model_of(Path(weights))
-        self._report = FrameReport()
+        self._report, self._times = FrameReport(), Times(self.device)
         # Whether the last frame whose noise is known has enough of it to be computed in bfloat16.
         self._rounds = False
         # Set by a caller that never writes into a frame again after passing it: then no buffer is copied.
@@ -286,7 +285,7 @@ class Denoiser:
             with torch.no_grad():
                 name, why = suitable_model(frame, still=self._frames == 1, cascade=bool(self._given))
             # Weights can be trained later, also if the caller infers only now.
-            with timed("pick", self.device), torch.inference_mode(False), torch.enable_grad():
+            with self._times.of("pick"), torch.inference_mode(False), torch.enable_grad():
                 self._make(name)
             self._picked = f"{name}: {why}"
             self._plan()
@@ -422,8 +421,9 @@ class Denoiser:
         _started.add(os.getpid())
         self._settle()
         self._report = report = FrameReport(precision=self._why_precision)
-        with listening(report), nullcontext() if self.differentiable else torch.no_grad():
-            with timed("validate", self.device):
+        self._times = times = Times(self.device)
+        with nullcontext() if self.differentiable else torch.no_grad():
+            with times.of("validate"):
                 if frame.color.is_meta and self.device.type != "meta":
                     raise InputError(
                         "frame: expected tensors with values, found tensors of the device meta, without any"
@@ -450,9 +450,9 @@ class Denoiser:
                 before, seen = self._continued(frame, report)
             noisy = frame.color
             computing = computing_in(precision, self.device)
-            with computing, self._explained(dtype), timed(self._name, self.device):
-                output, state = checked_step(self.model, frame, before, self._shape)
-            with timed("validate", self.device):
+            with computing, self._explained(dtype), times.of(self._name), times.of_modules(self.model, self._name):
+                output, state = checked_step(self.model, frame, before, self._shape, report.ask)
+            with times.of("validate"):
                 # A renderer may write its next frame into the same buffers, and a user may change an image in place.
                 state = state if self.frames_stay else owned(state, [given, noisy])
                 if stages:
@@ -460,7 +460,12 @@ class Denoiser:
                 output = completed(frame, output._replace(image=output.image.to(dtype)))
                 output = with_void(output, whole, void)
                 output = unwrapped(output, given.size[1]) if self.wrap else output
-                result: Output = owned(opened(output), [given, noisy, state])
+                report.add(output.notes)
+                output = opened(output)._replace(notes=())
+                result: Output = owned(output, [given, noisy, state])
+            report.send()
+        if at_hand(self.device):
+            report.milliseconds = times.milliseconds()
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
@@ -471,7 +476,9 @@ class Denoiser:
     def _prepared(self, frame: Frame, report: FrameReport) -> tuple[Frame, Void]:
         """The frame with valid values, void pixels filled, and layers that sum to its color."""
         filled, void = without_void(frame)
-        return closed(self._inspected(filled, report).with_depth()), void
+        if void.mask is not None:
+            report.add([Note("void", "filled from around, and kept")])
+        return closed(self._inspected(filled, report).with_depth(), report.ask), void
 
     def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
         """The frame with valid values. An invalid one raises an error, on a GPU only when the numbers have arrived."""
@@ -485,7 +492,7 @@ class Denoiser:
             report.repairs = repaired.judge(numbers)
             self._doubt(report.repairs.doubt)
 
-        ask(repaired.numbers, judge)
+        report.ask(repaired.numbers, judge)
         return repaired.frame
 
     def _continued(self, frame: Frame, report: FrameReport) -> tuple[State, Frame | None]:
@@ -528,6 +535,7 @@ class Denoiser:
         """Complete the report of the last frame; discard the history if that frame was invalid."""
         try:
             self._report.settle()
+            self._report.milliseconds = self._report.milliseconds or self._times.milliseconds()
         except InputError as error:
             self._state, self._shape, self._layers = None, (), ()
             self._before = self._seen = None
@@ -579,7 +587,7 @@ class Denoiser:
                 self._rounds = min(levels) > _ROUNDED
 
             # A GPU tells it when the next frame comes.
-            ask(noise_of(frame.color, frame.albedo, frame.normal).level, hear)
+            report.ask(noise_of(frame.color, frame.albedo, frame.normal).level, hear)
             if not self._rounds:
                 # Less memory than float32 needs may have been allowed.
                 with suppress(InputError):

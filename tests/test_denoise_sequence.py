@@ -21,7 +21,7 @@ from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.folder import denoise_sequence
 from mcdenoise.models import save_weights
 
-STAGES = ["validate", "accumulate", "plan", "network", "remodulate", "restore", "Chain"]
+STAGES = ["validate", "accumulate", "network", "plan", "Chain"]
 
 
 def small_model() -> nn.Module:

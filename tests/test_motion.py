@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import torch
+from reads import without_reads
 from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.models import Accumulated
-from mcdenoise.models._reads import without_reads
 from mcdenoise.motion import doubt_motion, seen_in
 
 HEIGHT, WIDTH, FRAMES = 72, 96, 3

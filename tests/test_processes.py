@@ -15,13 +15,11 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from reads import without_reads
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError, ops
-from mcdenoise.models import Journal, listening, note
 from mcdenoise.models._defaults import plain_defaults
-from mcdenoise.models._journal import journal
-from mcdenoise.models._reads import at_hand, without_reads
 from mcdenoise.ops._backend import choose_backend
 
 # Of each kind: kernels of a cascade, an a-trous filter, Open Image Denoise's network, and a local filter.
@@ -86,24 +84,20 @@ def test_denoisers_in_two_threads_are_those_alone(pair: tuple[int, int]) -> None
 
 
 def test_what_a_thread_sets_is_its_own() -> None:
-    inside, outside, own = threading.Event(), threading.Event(), Journal()
+    inside, outside = threading.Event(), threading.Event()
 
     def first() -> None:
-        with ops.use("torch"), without_reads(), listening(own):
+        with ops.use("torch"):
             inside.set()
             assert outside.wait(60)
-            note("first", "of its own thread")
 
-    def second() -> tuple[str, bool, Journal | None]:
+    def second() -> str:
         assert inside.wait(60)
-        found = choose_backend(["numba"], [torch.ones(1, 3, 128, 128)]), at_hand(CPU), journal()
-        note("second", "of another thread")
+        found = choose_backend(["numba"], [torch.ones(1, 3, 128, 128)])
         outside.set()
         return found
 
-    _, found = together(first, second)
-    assert found == ("numba", True, None)
-    assert list(own.stages) == ["first"]
+    assert together(first, second)[1] == "numba"
 
 
 def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
@@ -113,7 +107,7 @@ def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
 
     def refused(frame: Frame) -> int:
         denoiser, count = Denoiser("svgf", precision="float32"), 0
-        with ops.use("torch"), without_reads():
+        with ops.use("torch"):
             for _ in range(8):
                 try:
                     denoiser(frame)
@@ -122,7 +116,8 @@ def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
                     count += 1
         return count
 
-    assert together(lambda: refused(good), lambda: refused(broken)) == [0, 8]
+    with without_reads():
+        assert together(lambda: refused(good), lambda: refused(broken)) == [0, 8]
 
 
 def test_one_denoiser_takes_the_frames_of_several_threads_in_turn() -> None:

@@ -23,7 +23,7 @@ from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import Journal, create_model, listening
+from mcdenoise.models import Report, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
@@ -693,14 +693,15 @@ def test_history_follows_what_moves(moving: Path) -> None:
     kept = {}
     accumulated = create_model("accumulated")
     for known in (True, False):
-        state, journal = None, Journal()
+        state = None
         for number in sequence.numbers:
             frame, _ = sequence.frame(number).validate()
             assert frame.previous_position is not None
             moved = (frame.previous_position != frame.position).any(1, keepdim=True)
-            with listening(journal):
-                _, state = accumulated(frame if known else frame.replace(previous_position=None), state)
-        assert journal.reset == ""
+            output, state = accumulated(frame if known else frame.replace(previous_position=None), state)
+        report = Report()
+        report.add(output.notes)
+        assert report.reset == ""
         kept[known] = (state[0].length[moved] > 1).float().mean().item()
     assert kept[True] > 0.9
     assert kept[False] < kept[True] - 0.3

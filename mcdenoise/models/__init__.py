@@ -1,8 +1,7 @@
 """The zoo: denoisers assembled from the operators, by name, and wrappers that any method can use."""
 
 from mcdenoise.models._adapter import FromBuffers, as_model
-from mcdenoise.models._interface import Model, Needs, Output, State, prepared
-from mcdenoise.models._journal import Journal, Stage, listening, note, summarize, timed
+from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview, users_of
 from mcdenoise.models._precision import (
@@ -14,6 +13,7 @@ from mcdenoise.models._precision import (
 )
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model, troubles
 from mcdenoise.models._remembered import frames_remembered
+from mcdenoise.models._report import Report, Stage, summarize
 from mcdenoise.models._weights import (
     compared_models,
     create_model,
@@ -57,14 +57,15 @@ __all__ = [
     "Demodulated",
     "Exposed",
     "FromBuffers",
-    "Journal",
     "Model",
     "ModelOverview",
     "Needs",
+    "Note",
     "Output",
     "Precision",
     "Recurrent",
     "Region",
+    "Report",
     "Restored",
     "Skipping",
     "Stage",
@@ -86,10 +87,8 @@ __all__ = [
     "has_network",
     "has_random_weights",
     "list_models",
-    "listening",
     "load_weights",
     "model_of",
-    "note",
     "overview",
     "parts_of",
     "prepared",
@@ -98,7 +97,6 @@ __all__ = [
     "save_weights",
     "start_with",
     "summarize",
-    "timed",
     "troubles",
     "users_of",
     "with_carried",

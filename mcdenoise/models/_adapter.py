@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 
 CONTRACT = (
     "expected a model with `needs` that takes (frame, state) and returns (Output, state), or a module or function that "
@@ -64,8 +63,7 @@ class FromBuffers(nn.Module):
                 f"{', '.join(sorted(frame.buffers))}; render it, or give that argument a default value"
             )
         named = {name: frame.buffer(name) for name in sorted(self._needs.buffers | self._needs.uses)}
-        with timed(name_of_object(self.function), frame.color.device):
-            result = self.function(**{name: image for name, image in named.items() if image is not None})
+        result = self.function(**{name: image for name, image in named.items() if image is not None})
         if isinstance(result, Output):
             return result, None
         if not isinstance(result, Tensor):

@@ -14,15 +14,14 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._defaults import without_draws
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import ask
+from mcdenoise.models._interface import Ask, Model, Needs, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._registry import build_model, find_model, list_models
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.own import in_one_line, refused
 
 
-def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...]) -> tuple[Output, State]:
+def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...], ask: Ask) -> tuple[Output, State]:
     """Call a method, and reject a result that is not an image of the frame with a state of tensors.
 
     Args:
@@ -30,6 +29,7 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
         frame: with valid values.
         state: the state after the previous frame.
         shape: shape of the color of that previous frame.
+        ask: what the host asks a device for values by.
 
     Raises:
         InputError: the result breaks the contract of :class:`mcdenoise.models.Model` or is not finite, or the method
@@ -52,7 +52,7 @@ def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...
     if isinstance(found, Output) or not (isinstance(found, tuple) and len(found) == 2):
         raise InputError(f"model: expected a pair (Output, state), found {type(found).__name__}")
     output, after = found
-    _check_image(output, frame)
+    _check_image(output, frame, ask)
     _check_layers(output, frame)
     _check_state(state, after, frame)
     return output, after
@@ -129,7 +129,7 @@ def owned(tree: Any, others: Any) -> Any:
     return pytree.tree_map_only(Tensor, own, tree)
 
 
-def _check_image(output: Any, frame: Frame) -> None:
+def _check_image(output: Any, frame: Frame, ask: Ask) -> None:
     image = output.image if isinstance(output, Output) else None
     if not isinstance(image, Tensor) or image.shape != frame.color.shape:
         found = type(output).__name__ if not isinstance(image, Tensor) else f"an image of {tuple(image.shape)}"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from mcdenoise.models._journal import ask, journal
 from mcdenoise.models._reads import at_hand
 
 # A pixel may be this many times as bright as it was in the frame before. What is clamped there is believed a little
@@ -61,13 +59,7 @@ def _moved(image: Tensor, motion: Tensor | None) -> Tensor:
     return found
 
 
-def tell_clamped(light: Tensor, clamped: Tensor) -> None:
-    """Report the fraction of the light that clamping takes; both are ``(B, 3, H, W)``."""
-    if (found := journal()) is None:
-        return
+def clamped_fraction(light: Tensor, clamped: Tensor) -> Tensor:
+    """``(B,)`` fraction of the light of each image that clamping takes; both are ``(B, 3, H, W)``."""
     before, after = (image.detach().mean((1, 2, 3)) for image in (light, clamped))
-
-    def tell(fraction: Sequence[float]) -> None:
-        found.fireflies = max(found.fireflies, *fraction)
-
-    ask(torch.where(before > 0, (before - after) / torch.where(before > 0, before, 1), 0), tell)
+    return torch.where(before > 0, (before - after) / torch.where(before > 0, before, 1), 0)

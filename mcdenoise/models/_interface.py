@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
@@ -12,6 +12,30 @@ from mcdenoise.frame import Frame
 
 # Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
+# Takes values that a device computes, and what handles their numbers, in memory order, as soon as they are known.
+Ask: TypeAlias = Callable[[Tensor, Callable[[Sequence[float]], None]], None]
+
+
+class Note(NamedTuple):
+    """What a step tells about a frame, for its report.
+
+    Args:
+        name: of the stage, such as ``reproject``; or ``history`` with the fraction of the pixels that have one, and why
+            there is none; or ``fireflies`` with the fraction of the light that was clamped.
+        reason: why it was skipped, or why it was not.
+        skipped: fraction of the stage that was skipped. A tensor of one number is read when the report is, so that the
+            host does not wait for a GPU.
+        value: the figure, a number or a tensor; of several numbers the largest counts.
+        otherwise: the reason instead, if nothing was skipped after all.
+        exact: whether skipping leaves the pixels unchanged; otherwise they agree up to the tolerance.
+    """
+
+    name: str
+    reason: str = ""
+    skipped: float | Tensor = 0.0
+    value: float | Tensor | None = None
+    otherwise: str | None = None
+    exact: bool = True
 
 
 class Output(NamedTuple):
@@ -26,12 +50,26 @@ class Output(NamedTuple):
             :func:`mcdenoise.models._layers.completed`.
         alpha: ``(B, 1, H, W)`` alpha of the frame, filtered with the same kernels if ``frame.hints.alpha`` is set;
             ``None`` for a method without kernels.
+        notes: what the report of the frame shall tell; a wrapper passes on those of the method inside.
     """
 
     image: Tensor
     stages: Mapping[str, Tensor] = {}
     layers: Mapping[str, Tensor] = {}
     alpha: Tensor | None = None
+    notes: Sequence[Note] = ()
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Output:
+        """The same with a function of every image."""
+        stages, layers = (
+            {name: function(image) for name, image in each.items()} for each in (self.stages, self.layers)
+        )
+        alpha = None if self.alpha is None else function(self.alpha)
+        return Output(function(self.image), stages, layers, alpha, self.notes)
+
+    def noted(self, *notes: Note) -> Output:
+        """The same with these notes before its own."""
+        return self._replace(notes=(*notes, *self.notes))
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Output
-from mcdenoise.models._journal import ask, journal, note
+from mcdenoise.models._interface import Ask, Note, Output
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import cross_bilateral_filter, downsample, upsample
 
@@ -68,10 +67,9 @@ def answered(frame: Frame, image: Tensor, filtered: Tensor | None = None) -> Out
     parts = iter(filtered.split(3, 1))
     layers = {name: next(parts) for name in frame.layers}
     alpha = None if alpha_of(frame) is None else next(parts).clamp(0, 1)
-    for name, found in (("layers", bool(layers)), ("alpha", alpha is not None)):
-        if found:
-            note(name, "filtered with the kernels of the color")
-    return Output(image, layers=layers, alpha=alpha)
+    found = {"layers": bool(layers), "alpha": alpha is not None}
+    notes = [Note(name, "filtered with the kernels of the color") for name, there in found.items() if there]
+    return Output(image, layers=layers, alpha=alpha, notes=notes)
 
 
 def completed(frame: Frame, output: Output) -> Output:
@@ -83,12 +81,12 @@ def completed(frame: Frame, output: Output) -> Output:
     alpha = output.alpha
     if alpha is None and alpha_of(frame) is not None:
         alpha = frame.alpha
-        _note_once("alpha", "unchanged: the method has no kernels")
+        output = _noted_once(output, Note("alpha", "unchanged: the method has no kernels"))
     if not frame.layers:
         return output._replace(alpha=alpha)
     parts = output.layers
     if not parts:
-        _note_once("layers", "the image is split by their fractions: the method has no kernels")
+        output = _noted_once(output, Note("layers", "the image is split by their fractions: the method has no kernels"))
         parts = fractions(frame, output.image)
     return output._replace(layers=split(output.image, parts), alpha=alpha)
 
@@ -149,11 +147,15 @@ def _smoothed(image: Tensor, guide: Tensor) -> Tensor:
     return cross_bilateral_filter(image, logits, [guide], [scale], border="renormalize")
 
 
-def closed(frame: Frame) -> Frame:
+def closed(frame: Frame, ask: Ask) -> Frame:
     """The frame with layers that sum to its color: the remainder is added as the layer :data:`REST`.
 
     Half precision rounds every layer separately. Where the layers are together brighter than the color, they are scaled
     to it; so they are everywhere if the remainder is within the rounding error.
+
+    Args:
+        frame: with valid values.
+        ask: what the host asks a device for values by.
 
     Raises:
         InputError: the layers are brighter than the color by more than that, so they are not its parts.
@@ -193,7 +195,6 @@ def _sum(parts: Mapping[str, Tensor]) -> Tensor:
     return first
 
 
-def _note_once(name: str, reason: str) -> None:
-    """Report a stage unless the method has reported it itself."""
-    if (found := journal()) is not None and name not in found.stages:
-        note(name, reason)
+def _noted_once(output: Output, note: Note) -> Output:
+    """The output with a note, unless the method has one of this name itself."""
+    return output if any(each.name == note.name for each in output.notes) else output.noted(note)

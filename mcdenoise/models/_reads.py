@@ -6,25 +6,9 @@ for all queued work, so a step reads nothing there and computes everything, as a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
-
 import torch
-
-_reads_disabled: ContextVar[bool] = ContextVar("reads_disabled", default=False)
 
 
 def at_hand(device: torch.device) -> bool:
     """Whether the host may read values on a device while a step runs; a graph being recorded has none."""
-    return device.type == "cpu" and not torch.compiler.is_compiling() and not _reads_disabled.get()
-
-
-@contextmanager
-def without_reads() -> Iterator[None]:
-    """Make steps of this thread on a CPU read no values inside this block, as on a GPU."""
-    token = _reads_disabled.set(True)
-    try:
-        yield
-    finally:
-        _reads_disabled.reset(token)
+    return device.type == "cpu" and not torch.compiler.is_compiling()

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
-from mcdenoise.models._journal import note
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models.exposed import scaled
 
@@ -73,7 +72,6 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
             frame = _divided(frame, divisor)
     if void is None or (known and not void.any()):
         return frame, Void(None, divisor)
-    note("void", "filled from around, and kept")
     source = _mirrored(void)
 
     def fill(image: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Output
@@ -35,4 +34,4 @@ def unwrapped(output: Output, width: int) -> Output:
     def crop(image: Tensor) -> Tensor:
         return image[..., start : start + width].contiguous() if image.shape[-1] == width + 2 * start else image
 
-    return Output(*pytree.tree_map_only(Tensor, crop, tuple(output)))
+    return output.map(crop)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor, nn
 
@@ -23,6 +23,8 @@ class Wrapper(nn.Module):
     """
 
     inner: Model
+    # Under which name the report has the run time of what a wrapper does itself.
+    stage: ClassVar[str] = "network"
 
     def __init__(self, inner: Model) -> None:
         super().__init__()

@@ -13,8 +13,7 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import Journal, ask, journal, note, tell_history, timed
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
@@ -150,6 +149,8 @@ class Accumulated(Wrapper):
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
         self.clamp_current, self.also = clamp_current, tuple(also)
 
+    stage = "accumulate"
+
     @property
     def needs(self) -> Needs:
         """The needs of the method inside, except for the buffers made here; buffers that tell motion are of use."""
@@ -172,17 +173,18 @@ class Accumulated(Wrapper):
         kept, inner = own_pair(state, "accumulated")
         channels = RECENT.stop if math.isfinite(self.lag_threshold) else COLOR.stop
         history = own_state(kept, History, frame, channels=channels)
-        with timed("accumulate", frame.color.device):
-            accumulated, history, inner = self._accumulate(frame.with_depth(), history, inner)
+        accumulated, history, inner, notes = self._accumulate(frame.with_depth(), history, inner)
         del frame
         output, inner = self.inner(accumulated, inner)
         output = completed(accumulated, output)
         stages = {"accumulated": accumulated.color, **output.stages}
         after = None if history is None and inner is None else (history, inner)
-        return output._replace(stages=stages), after
+        return output._replace(stages=stages).noted(*notes), after
 
-    def _accumulate(self, frame: Frame, history: History | None, inner: State) -> tuple[Frame, History | None, State]:
-        """The frame with its history, the history for the next one, and the state that the method inside may have."""
+    def _accumulate(
+        self, frame: Frame, history: History | None, inner: State
+    ) -> tuple[Frame, History | None, State, list[Note]]:
+        """The frame with its history, that for the next one, the state that the method inside may have, and notes."""
         # In a graph and on a GPU no value is read: both branches of each decision are computed.
         blind = not at_hand(frame.color.device)
         can_move = tells_motion(frame.buffers)
@@ -201,11 +203,13 @@ class Accumulated(Wrapper):
         seen = lights(entering[:, MEAN]) if compared else None
         carried: _Carried = ()
         still: bool | Tensor = False
+        found: Tensor | None = None
+        blind_cut: Tensor | None = None
         if not reset and history is not None:
             still = is_still(frame, history.view_projection)
             color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
-            cut = kept.mean() < CUT_FRACTION
-            tell_history(kept.mean())
+            found = kept.mean()
+            cut = found < CUT_FRACTION
             if blind or not cut:
                 carried = self._blend_carried(frame, entering, seen, history, still)
             if blind:
@@ -217,7 +221,7 @@ class Accumulated(Wrapper):
                 length = torch.where(cut, 1, length)
                 limit = torch.where(cut, 0, limit)
                 inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
-                self._tell_cut(cut)
+                blind_cut = cut.float()
             elif cut:
                 reset = "cut"
                 # The light of the new shot may differ, and the cut is found only here.
@@ -230,8 +234,11 @@ class Accumulated(Wrapper):
             carried = self._first(frame, entering)
             inner, still = None, False
         still_for_sure = not blind and bool(still)
-        if (found := journal()) is not None:
-            self._report(found, frame, reset, still=still_for_sure, can_move=can_move, keeps=keeps)
+        notes = self._notes(frame, still=still_for_sure, can_move=can_move, keeps=keeps)
+        if blind_cut is None:
+            notes.append(Note("history", reset, value=found))
+        else:
+            notes.append(Note("history", "cut", blind_cut, found, otherwise=""))
         after = None
         current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
         del entering
@@ -243,7 +250,7 @@ class Accumulated(Wrapper):
         hints = frame.hints._replace(still=still_for_sure)
         # Statistics of the noisy image are not passed on.
         seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
-        return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner
+        return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner, notes
 
     def _first(self, frame: Frame, entering: Tensor) -> _Carried:
         """Layers, alpha and the buffers of ``also`` of a frame without a history."""
@@ -346,24 +353,16 @@ class Accumulated(Wrapper):
             return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
         return torch.where(light_of_fireflies(color) > _LOST, CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
 
-    def _tell_cut(self, cut: Tensor) -> None:
-        if (found := journal()) is None:
-            return
-
-        def tell(cut: Sequence[float]) -> None:
-            found.reset = "cut" if cut[0] else found.reset
-
-        ask(cut, tell)
-
-    def _report(self, found: Journal, frame: Frame, reset: str, *, still: bool, can_move: bool, keeps: bool) -> None:
-        found.reset = reset
+    def _notes(self, frame: Frame, *, still: bool, can_move: bool, keeps: bool) -> list[Note]:
         source = "motion" if frame.motion is not None else "positions and cameras"
         lost = "" if can_move else "no motion, and no positions with cameras: single frames"
         alone = "one frame" if frame.hints.alone and not frame.hints.keep_all else lost
-        note("accumulate", alone or source, float(alone != ""))
         why = alone or ("nothing moves in the image" if still and not frame.hints.keep_all else "")
-        note("reproject", why or source, float(why != ""))
-        note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps))
+        return [
+            Note("accumulate", alone or source, float(alone != "")),
+            Note("reproject", why or source, float(why != "")),
+            Note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps)),
+        ]
 
 
 def surface_before(frame: Frame) -> Surface:

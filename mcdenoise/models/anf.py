@@ -38,8 +38,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import note, timed
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
@@ -98,9 +97,8 @@ class Anf(nn.Module):
         light = with_carried(frame).to(frame.color.dtype)
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
-        with timed("accumulate", light.device):
-            found, known = from_before(frame, state, channels=sum(sizes), keeper="anf")
-            result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
+        found, known, notes = from_before(frame, state, channels=sum(sizes), keeper="anf")
+        result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
 
         unet_input = torch.cat([embedded, embedded_before], 1)
         predicted = self.head(self.unet(unet_input)[0], frame.size).to(light.dtype)
@@ -111,20 +109,19 @@ class Anf(nn.Module):
 
         image, features = mean, filters[-1][:, :FEATURES]
         of_before = (result_before, features_before, last[:, 1:].square(), known)
-        with timed("filter", light.device):
-            for k, each in enumerate(filters):
-                own, root, logit = each.split([FEATURES, 1, 1], 1)
-                image = affinity_filter(
-                    image,
-                    own,
-                    root.square(),
-                    torch.sigmoid(logit),
-                    *(of_before if k == FILTERS - 1 else ()),
-                    kernel_size=KERNEL_SIZE,
-                    dilation=1 << k,
-                )
+        for k, each in enumerate(filters):
+            own, root, logit = each.split([FEATURES, 1, 1], 1)
+            image = affinity_filter(
+                image,
+                own,
+                root.square(),
+                torch.sigmoid(logit),
+                *(of_before if k == FILTERS - 1 else ()),
+                kernel_size=KERNEL_SIZE,
+                dilation=1 << k,
+            )
         kept = to_be_kept(frame, torch.cat([image, mean, embedded_mean, features], 1))
-        return answered(frame, image), kept
+        return answered(frame, image).noted(*notes, Note("samples", describe_samples(frame))), kept
 
     def embedded(self, frame: Frame) -> Tensor:
         """The mean embedding of the samples of each pixel, ``(B, width, H, W)``."""
@@ -133,7 +130,6 @@ class Anf(nn.Module):
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
         radiance = samples_of(frame).to(frame.color.dtype)
-        note("samples", describe_samples(frame))
         total: Tensor | None = None
         count = radiance.shape[1]
         for sample in range(count):

@@ -14,7 +14,6 @@ from torch import Tensor
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import has_motion, motion_unless_still
@@ -53,6 +52,8 @@ class Antialiased(Wrapper):
         InputError: ``alpha`` is out of its range.
     """
 
+    stage = "antialias"
+
     def __init__(self, inner: Model, *, alpha: float = 0.2) -> None:
         super().__init__(inner)
         if not 0 < alpha <= 1:
@@ -75,14 +76,13 @@ class Antialiased(Wrapper):
         inner, shown = own_pair(state, "antialiased")
         before = own_state(shown, Shown, frame)
         output, inner = self.inner(frame, inner)
-        with timed("antialias", frame.color.device):
-            image = _mapped(output.image)
-            result = image
-            if before is not None and before.image.shape == image.shape:
-                result = self._blended(image, before, frame)
-            after = inner, Shown(result, frame.view_projection)
-            stages = {**output.stages, "denoised": output.image}
-            return output._replace(image=_unmapped(result), stages=stages), after
+        image = _mapped(output.image)
+        result = image
+        if before is not None and before.image.shape == image.shape:
+            result = self._blended(image, before, frame)
+        after = inner, Shown(result, frame.view_projection)
+        stages = {**output.stages, "denoised": output.image}
+        return output._replace(image=_unmapped(result), stages=stages), after
 
     def _blended(self, image: Tensor, before: Shown, frame: Frame) -> Tensor:
         if not has_motion(frame, before.view_projection):

@@ -40,7 +40,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
@@ -129,12 +128,10 @@ class Bmfr(nn.Module):
         color, light = frame.color, with_carried(frame)
         history = own_state(state, History, frame, channels=light.shape[1])
         number = torch.zeros_like(color[:, :1, :1, :1]) if history is None else history.number
-        with timed("fit", color.device):
-            images = self._fitted(frame, light, number)
-            fitted = images[:, :3]
+        images = self._fitted(frame, light, number)
+        fitted = images[:, :3]
         if history is not None:
-            with timed("accumulate again", color.device):
-                images = self._accumulated(frame, images, history)
+            images = self._accumulated(frame, images, history)
         surface = Surface(frame.position, frame.normal)
         after = History(images, surface, frame.view_projection, (number + 1) % len(_OFFSETS))
         return answered(frame, images)._replace(stages={"fitted": fitted}), after

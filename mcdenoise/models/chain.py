@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, Skip
 from mcdenoise.models._adapter import as_model
-from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._layers import completed
 from mcdenoise.models._state import own_parts
 from mcdenoise.models._wrapper import Wrapper
@@ -62,6 +62,7 @@ class Chain(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         states: dict[str, Any] = own_parts(state, self._names)
         stages: dict[str, Tensor] = {}
+        notes: list[Note] = []
         last, skip = self._names[-1], frame.skip
         for name in self._names:
             method: Model = getattr(self, name)
@@ -75,12 +76,14 @@ class Chain(nn.Module):
                 output = output._replace(image=image)
             output = completed(frame, output)
             image = output.image
+            notes += output.notes
             stages |= {f"{name}.{stage}": each for stage, each in output.stages.items()}
             if name != last:
                 stages[name] = image
             alpha = frame.alpha if output.alpha is None else output.alpha
             frame = frame.replace(color=image, layers=output.layers, alpha=alpha)
-        return output._replace(stages=stages), states if any(each is not None for each in states.values()) else None
+        state = states if any(each is not None for each in states.values()) else None
+        return output._replace(stages=stages, notes=notes), state
 
 
 def _has_statistics(model: Model) -> bool:

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._fireflies import GAIN, steady, tell_clamped
-from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import timed
+from mcdenoise.models._fireflies import GAIN, clamped_fraction, steady
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import CAUSTICS, light_of_fireflies, motion_to_previous
@@ -51,6 +50,8 @@ class Clamped(Wrapper):
         inner: any method.
     """
 
+    stage = "clamp"
+
     @property
     def needs(self) -> Needs:
         """The needs of the inner method; albedo is used, and the limit depends on the whole image."""
@@ -66,10 +67,9 @@ class Clamped(Wrapper):
         """See :class:`mcdenoise.models.Model`."""
         kept, inner = own_pair(state, "clamped")
         before = own_state(kept, Kept, frame, channels=1)
-        with timed("clamp", frame.color.device):
-            clamped, steady_light, after = _clamped(frame, before)
+        clamped, steady_light, after, note = _clamped(frame, before)
         output, inner = self.inner(clamped, inner)
-        output = output._replace(image=output.image + steady_light.to(output.image.dtype))
+        output = output._replace(image=output.image + steady_light.to(output.image.dtype)).noted(note)
         return output, None if after is None and inner is None else (after, inner)
 
 
@@ -79,12 +79,12 @@ def without_fireflies(frame: Frame) -> Frame:
     The limit rises from 30 to 120 with the fraction of the light that fireflies have: the more it is, the more likely
     they are caustics. All other pixels remain as they are, and all of them do in a frame with hardly any noise.
     """
-    clamped, clean, _ = _clamped(frame, None)
+    clamped, clean, _, _ = _clamped(frame, None)
     return frame.replace(color=clamped.color + clean)
 
 
-def _clamped(frame: Frame, kept: Kept | None) -> tuple[Frame, Tensor, Kept | None]:
-    """The frame with clamped fireflies, the light that the clamp took and that is none, and what to keep."""
+def _clamped(frame: Frame, kept: Kept | None) -> tuple[Frame, Tensor, Kept | None, Note]:
+    """The frame with clamped fireflies, the light that the clamp took and that is none, what to keep, and a note."""
     light = incoming(frame.color, frame.albedo, torch.inf, compared=False)
     common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
     limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
@@ -99,10 +99,10 @@ def _clamped(frame: Frame, kept: Kept | None) -> tuple[Frame, Tensor, Kept | Non
         believed = believed if passed is None else passed
     after = believed.sum(1, keepdim=True)
     color, bright = _scaled(frame.color, full, least), _scaled(frame.color, full, after)
-    tell_clamped(frame.color, bright)
+    note = Note("fireflies", value=clamped_fraction(frame.color, bright))
     keeps = frame.hints.keep_all or not frame.hints.last
     kept = Kept(after.detach(), frame.view_projection) if keeps else None
-    return frame.replace(color=color), bright - color, kept
+    return frame.replace(color=color), bright - color, kept, note
 
 
 def _scaled(color: Tensor, before: Tensor, after: Tensor) -> Tensor:

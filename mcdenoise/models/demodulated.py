@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame, scale_samples
-from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import note, timed
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
@@ -29,6 +28,8 @@ class Demodulated(Wrapper):
             radiance, samples, and the variance. Specular radiance is not demodulated.
     """
 
+    stage = "accumulate"
+
     @property
     def needs(self) -> Needs:
         """The needs of the inner method; the albedo is used."""
@@ -41,21 +42,20 @@ class Demodulated(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        albedo, device = frame.albedo, frame.color.device
+        albedo = frame.albedo
         reason = "" if frame.hints.keep_all and albedo is not None else _why_not(albedo)
-        note("demodulate", reason or "albedo", float(reason != ""))
+        note = Note("demodulate", reason or "albedo", float(reason != ""))
         if albedo is None or reason:
-            return self.inner(frame, state)
-        with timed("accumulate", device):
-            handed = [_without_albedo(frame)]
+            output, state = self.inner(frame, state)
+            return output.noted(note), state
+        handed = [_without_albedo(frame)]
         wanted = frame.hints.stages
         del frame
         output, state = run(self.inner, handed, state)
-        with timed("remodulate", device):
-            # A network that ends with a convolution returns half precision under autocast.
-            stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
-            layers = {name: _with(albedo, layer) for name, layer in output.layers.items()}
-            return Output(_with(albedo, output.image), stages, layers, output.alpha), state
+        # A network that ends with a convolution returns half precision under autocast.
+        stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
+        layers = {name: _with(albedo, layer) for name, layer in output.layers.items()}
+        return output._replace(image=_with(albedo, output.image), stages=stages, layers=layers).noted(note), state
 
 
 def _without_albedo(frame: Frame) -> Frame:

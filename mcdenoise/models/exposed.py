@@ -35,7 +35,7 @@ class Exposed(Wrapper):
         output, state = self.inner(scaled(frame, exposure), state)
         stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}
         layers = {name: layer / exposure for name, layer in output.layers.items()}
-        return Output(output.image / exposure, stages, layers, output.alpha), state
+        return output._replace(image=output.image / exposure, stages=stages, layers=layers), state
 
 
 def scaled(frame: Frame, factor: Tensor) -> Frame:

@@ -42,8 +42,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import note
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -125,10 +124,8 @@ class KpcnNetwork(nn.Module):
         others = carried(frame)
         if frame.diffuse is None or frame.specular is None or self.specular is None:
             reason = "these weights are for color alone" if self.specular is None else "no diffuse and specular light"
-            note("specular branch", reason, 1.0)
             image, others = self.diffuse.filtered(frame.color, others, frame)
-            return answered(frame, image, others), None
-        note("specular branch", "diffuse and specular light")
+            return answered(frame, image, others).noted(Note("specular branch", reason, 1.0)), None
         matt, of_matt = self.diffuse.filtered(frame.diffuse, others, frame)
         logarithm, of_shiny = self.specular.filtered(torch.log1p(frame.specular), others, frame)
         shiny = torch.expm1(logarithm)
@@ -142,7 +139,8 @@ class KpcnNetwork(nn.Module):
             lit = image > 0
             part = torch.where(lit, shiny / torch.where(lit, image, 1), 0).mean(1, keepdim=True)
             others = torch.lerp(of_matt, of_shiny, part)
-        return answered(frame, image, others), None
+        note = Note("specular branch", "diffuse and specular light")
+        return answered(frame, image, others).noted(note), None
 
 
 def _seen(image: Tensor, frame: Frame) -> Tensor:

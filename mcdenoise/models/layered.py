@@ -34,8 +34,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import note
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -103,7 +102,6 @@ class LayeredNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
-        note("samples", describe_samples(frame))
         embedded, context = self.embedding(samples_input(frame, light))
         logits = of_each(self.partition, with_context(embedded, context)).to(light.dtype)
         weights = _LEAST + (1 - LAYERS * _LEAST) * torch.softmax(logits, 2)
@@ -125,7 +123,7 @@ class LayeredNetwork(nn.Module):
                 alpha = torch.sigmoid(alphas[:, number : number + 1])
                 image = image + seen_through * alpha * mean
                 seen_through = seen_through * (1 - alpha)
-        return answered(frame, image), None
+        return answered(frame, image).noted(Note("samples", describe_samples(frame))), None
 
 
 @register_model(

@@ -40,7 +40,6 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
 from mcdenoise.models._registry import register_model
@@ -97,20 +96,18 @@ class NeuralBilateralGrid(TenChannels):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        with timed("network", frame.color.device):
-            *guides, first, second = self.predicted(frame).split(1, 1)
-        with timed("filter", frame.color.device):
-            if self.training:
-                guides = [_limited(guide) for guide in guides]
-            light = with_carried(frame)
-            smooth = [_smoothed(light, *each) for each in zip(guides, GRIDS, strict=True)]
-            weights = [first, second, 1 - first - second]
-            image = _sum(weights, [each[:, :3] for each in smooth]).clamp_min(0)
-            if light.shape[1] == 3:
-                return Output(image), None
-            # Layers and alpha require a mean with non-negative weights.
-            weights = [weight.clamp_min(0) for weight in weights]
-            total = _sum(weights, [each[:, 3:] for each in smooth]) / (weights[0] + weights[1] + weights[2])
+        *guides, first, second = self.predicted(frame).split(1, 1)
+        if self.training:
+            guides = [_limited(guide) for guide in guides]
+        light = with_carried(frame)
+        smooth = [_smoothed(light, *each) for each in zip(guides, GRIDS, strict=True)]
+        weights = [first, second, 1 - first - second]
+        image = _sum(weights, [each[:, :3] for each in smooth]).clamp_min(0)
+        if light.shape[1] == 3:
+            return Output(image), None
+        # Layers and alpha require a mean with non-negative weights.
+        weights = [weight.clamp_min(0) for weight in weights]
+        total = _sum(weights, [each[:, 3:] for each in smooth]) / (weights[0] + weights[1] + weights[2])
         return answered(frame, image, total), None
 
 

@@ -48,8 +48,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import journal, note, tell_history, timed
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
@@ -225,54 +224,55 @@ class Nppd(nn.Module):
         if others is not None:
             radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
         state = own_state(state, History, frame, channels=radiance.shape[1])
-        device = frame.color.device
-        with timed("accumulate", device):
-            mean_before, image_before, features_before = self._warped(frame, state, radiance)  #                     1.
-        with timed("network", device):
-            features = self._encoded(frame, dtype)  #                                                               2.
-            both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
-            # As in Tiled, there is a mirror image around the image, except in training.
-            border = 0 if self.training else MIRRORED
-            radiance, mean_before, image_before, features, features_before, both = (
-                mirrored(image, (border, border), (border, border))
-                for image in (radiance, mean_before, image_before, features, features_before, _logarithm(both))
-            )
-            fine, coarse = self._weights(torch.cat([both, features_before, features], 1))  #                        3.
-        with timed("filter", device):
-            trust, mix = torch.sigmoid(fine["lambda"]), torch.sigmoid(fine["mu"])
-            radiance = torch.lerp(radiance, mean_before, trust)  #                                                  4.
-            features = torch.lerp(features, features_before, trust)
-            denoised = _denoised(radiance, fine, coarse)  #                                                         5.
-            image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), mix)  #                         6.
-            inside = Region(border, border, border + frame.size[0], border + frame.size[1])
-            radiance, image, features = (inside.of(each).contiguous() for each in (radiance, image, features))
+        reset = self._reset(frame, state)
+        warped, history = self._warped(frame, None if reset else state, radiance)  #                                1.
+        mean_before, image_before, features_before = warped
+        features = self._encoded(frame, dtype)  #                                                                   2.
+        both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
+        # As in Tiled, there is a mirror image around the image, except in training.
+        border = 0 if self.training else MIRRORED
+        radiance, mean_before, image_before, features, features_before, both = (
+            mirrored(image, (border, border), (border, border))
+            for image in (radiance, mean_before, image_before, features, features_before, _logarithm(both))
+        )
+        fine, coarse = self._weights(torch.cat([both, features_before, features], 1))  #                            3.
+        trust, mix = torch.sigmoid(fine["lambda"]), torch.sigmoid(fine["mu"])
+        radiance = torch.lerp(radiance, mean_before, trust)  #                                                      4.
+        features = torch.lerp(features, features_before, trust)
+        denoised = _denoised(radiance, fine, coarse)  #                                                             5.
+        image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), mix)  #                             6.
+        inside = Region(border, border, border + frame.size[0], border + frame.size[1])
+        radiance, image, features = (inside.of(each).contiguous() for each in (radiance, image, features))
         stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
         result = image[:, :3].to(frame.color.dtype)
         output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)
+        output = output.noted(Note("history", reset, value=history), Note("samples", describe_samples(frame)))
         keeps = frame.hints.keep_all or not frame.hints.last
         return output, History(radiance, image, features, frame.view_projection) if keeps else None
 
-    def _warped(self, frame: Frame, before: History | None, radiance: Tensor) -> list[Tensor]:
-        """Previous mean radiance, result and features, reprojected to this frame; 0 where there is no history."""
+    def _reset(self, frame: Frame, before: History | None) -> str:
+        """Why the history is discarded; empty if it is used."""
+        if before is None:
+            return "first frame"
+        if before.radiance.shape[0] != len(frame.color) or before.radiance.shape[2:] != frame.color.shape[2:]:
+            return "size change"
+        return "" if has_motion(frame, before.view_projection) else "no motion"
+
+    def _warped(self, frame: Frame, before: History | None, radiance: Tensor) -> tuple[Sequence[Tensor], Tensor | None]:
+        """Previous mean radiance, result and features, reprojected to this frame, 0 where there is no history.
+
+        Also the fraction of the pixels that have one.
+        """
         channels = [radiance.shape[1], radiance.shape[1], FEATURES]
-        reset, motion = "first frame", None
-        if before is not None:
-            alike = before.radiance.shape == radiance.shape
-            known = has_motion(frame, before.view_projection)
-            reset = "size change" if not alike else "" if known else "no motion"
-        if (found := journal()) is not None:
-            found.reset = reset
-        if reset or before is None:
-            return list(radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1))
+        if before is None:
+            return radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1), None
         motion = motion_unless_still(frame, before.view_projection)
         warped, weight = reproject(torch.cat(before[:3], 1).to(radiance.dtype), motion)
-        tell_history(weight.mean())
-        return list(warped.split(channels, 1))
+        return warped.split(channels, 1), weight.mean()
 
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
         """The mean of the samples' features."""
         samples = samples_of(frame).to(dtype)
-        note("samples", describe_samples(frame))
         albedo, normal, depth = features_of(frame)
         pixel = torch.cat([normalize_depth(depth), normal, albedo], 1).to(dtype)
         count = samples.shape[1]

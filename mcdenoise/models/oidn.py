@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
@@ -29,7 +28,7 @@ Auxiliary = Literal["noisy", "clean", "prefiltered"]
 Source = Literal["raw", "accumulated", "demodulated", "accumulated after"]
 
 
-class Oidn:
+class Oidn(nn.Module):
     """Open Image Denoise on the CPU, applied to the frame's color; device, filters and buffers are kept between frames.
 
     Filters are created when they are first needed, and again when the image size changes. There are no derivatives.
@@ -48,6 +47,7 @@ class Oidn:
     def __init__(
         self, quality: Quality = "high", auxiliary: Auxiliary = "noisy", *, threads: int | None = None
     ) -> None:
+        super().__init__()
         _check("quality", quality, Quality)
         _check("auxiliary", auxiliary, Auxiliary)
         if threads is not None and threads < 1:
@@ -73,7 +73,7 @@ class Oidn:
         """Needs color; uses albedo and normal. The result depends on the whole image through its exposure."""
         return Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
 
-    def __call__(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`.
 
         Raises:
@@ -96,7 +96,7 @@ class Oidn:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
         if auxiliary == "prefiltered":
             frame = self.with_clean_features(frame, "high")
-        with timed("network", frame.color.device), torch.no_grad():
+        with torch.no_grad():
             image = self.filtered({"color": frame.color, **guides_of(frame)}, self.quality, clean=auxiliary != "noisy")
         return image.to(frame.color.dtype)
 
@@ -110,7 +110,7 @@ class Oidn:
         Raises:
             RuntimeError: the library reports an error; the message is the library's.
         """
-        with timed("network", frame.color.device), torch.no_grad():
+        with torch.no_grad():
             clean = {
                 name: self.filtered({name: image}, quality, clean=False) for name, image in guides_of(frame).items()
             }

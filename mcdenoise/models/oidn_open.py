@@ -19,7 +19,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
-from mcdenoise.models._journal import timed
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._tza import Archive, archives_in, read_tza
 from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, guides_of, library_of_oidn
@@ -64,10 +63,9 @@ class OidnOpen(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
-        with timed("network", frame.color.device):
-            features = {name: frame.buffer(name) for name in self.features}
-            seen = seen_by_oidn(compress(frame.color * exposure), **features)
-            image = expand(self.unet(seen).to(exposure.dtype)) / exposure
+        features = {name: frame.buffer(name) for name in self.features}
+        seen = seen_by_oidn(compress(frame.color * exposure), **features)
+        image = expand(self.unet(seen).to(exposure.dtype)) / exposure
         return Output(image.to(frame.color.dtype)), None
 
 
@@ -158,11 +156,8 @@ class OpenFilters(nn.Module):
 
     def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
         """The frame with denoised features, see :meth:`mcdenoise.models.oidn.Oidn.with_clean_features`."""
-        with timed("network", frame.color.device):
-            guides = guides_of(frame).items()
-            clean = {
-                name: self._network((name,), quality, clean=False).to(image.device)(image) for name, image in guides
-            }
+        guides = guides_of(frame).items()
+        clean = {name: self._network((name,), quality, clean=False).to(image.device)(image) for name, image in guides}
         return frame.replace(**clean)
 
     def _network(self, images: tuple[str, ...], quality: Quality, *, clean: bool) -> Any:

@@ -23,7 +23,6 @@ from torch.func import functional_call
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._layers import answered
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.clamped import Clamped
@@ -113,11 +112,10 @@ class TunedNetwork(nn.Module):
         exposure = statistics["oidn_exposure"]
         before, light = (frame.extra.get(name, torch.zeros_like(color)) for name in (PREVIOUS, PREVIOUS_LIGHT))
         valid = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(color[:, :1]))
-        with timed("network", color.device):
-            buffers = (color, before, light, frame.albedo, frame.normal, valid, exposure)
-            seen, images = tuned_input(*buffers, self.unet.multiple)
-            predicted = corner(self._predicted(seen, statistics["start_fraction"]), *frame.size)
-            image = tuned_choice(predicted, images, valid, exposure, _LOGITS).to(color.dtype)
+        buffers = (color, before, light, frame.albedo, frame.normal, valid, exposure)
+        seen, images = tuned_input(*buffers, self.unet.multiple)
+        predicted = corner(self._predicted(seen, statistics["start_fraction"]), *frame.size)
+        image = tuned_choice(predicted, images, valid, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image, None), None
 
     def _predicted(self, seen: Tensor, fractions: Tensor) -> Tensor:

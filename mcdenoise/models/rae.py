@@ -40,8 +40,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame, tells_motion
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import ask, journal
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
@@ -123,7 +122,7 @@ class Rae(nn.Module):
         memory = own_state(state, Memory, frame, channels=self.encoder[0].entry.out_channels)
         # As in Tiled, there is a mirror image around the image, except in training.
         border = 0 if self.training else MIRRORED
-        x, hidden = mirrored(input_of(frame), (border, border), (border, border)), _recalled(frame, memory)
+        x, (hidden, notes) = mirrored(input_of(frame), (border, border), (border, border)), _recalled(frame, memory)
         found: list[Tensor] = []
         for stage, before in zip(self.encoder, hidden, strict=False):
             x = stage(x, before)
@@ -140,7 +139,7 @@ class Rae(nn.Module):
         x = x.narrow(-2, border, color.shape[-2]).narrow(-1, border, color.shape[-1])
         image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), maximum))
         kept = to_be_kept(frame, torch.zeros_like(color[:, :1]))
-        return Output(image), None if kept is None else Memory(after, kept)
+        return Output(image, notes=notes), None if kept is None else Memory(after, kept)
 
 
 def input_of(frame: Frame) -> Tensor:
@@ -171,25 +170,19 @@ def view_normal(frame: Frame) -> Tensor:
     return torch.cat(found, 1)
 
 
-def _recalled(frame: Frame, memory: Memory | None) -> list[Tensor | None]:
-    """The hidden states of the previous frame; ``None`` at the beginning of a shot."""
+def _recalled(frame: Frame, memory: Memory | None) -> tuple[list[Tensor | None], tuple[Note, ...]]:
+    """The hidden states of the previous frame, ``None`` at the beginning of a shot; and notes about them."""
     nothing: list[Tensor | None] = [None] * (STAGES + 1)
     fits = memory is not None and memory.before.image.shape == frame.color[:, :1].shape
     if memory is None or not fits:
-        if (found := journal()) is not None:
-            found.reset = "first frame" if memory is None else "size change"
-        return nothing
+        return nothing, (Note("history", "first frame" if memory is None else "size change"),)
     if not tells_motion(frame.buffers):
-        return list(memory.hidden)
-    _, weight = from_before(frame, memory.before, channels=1)
+        return list(memory.hidden), ()
+    _, weight, notes = from_before(frame, memory.before, channels=1)
     goes_on = weight.mean((1, 2, 3), keepdim=True) >= CUT_FRACTION
-    if (found := journal()) is not None and not found.reset:
-
-        def tell(any_goes_on: Sequence[float]) -> None:
-            found.reset = "" if any_goes_on[0] else "cut"
-
-        ask(goes_on.any(), tell)
-    return [torch.where(goes_on, hidden, 0) for hidden in memory.hidden]
+    if not notes[0].reason:
+        notes = (*notes, Note("history", "cut", (~goes_on.any()).float(), weight.mean(), otherwise=""))
+    return [torch.where(goes_on, hidden, 0) for hidden in memory.hidden], notes
 
 
 def _conv(entering: int, leaving: int) -> nn.Conv2d:

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import journal, note, tell_history, timed
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
@@ -57,6 +56,8 @@ class Recurrent(Wrapper):
         albedo: name of the buffer that images are demodulated with; a frame without it is not demodulated.
     """
 
+    stage = "accumulate"
+
     def __init__(self, inner: Model, *, albedo: str = "albedo") -> None:
         super().__init__(inner)
         self.albedo = albedo
@@ -78,8 +79,7 @@ class Recurrent(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
-        with timed("accumulate", frame.color.device):
-            image, weight = from_before(frame, state, channels=6, sharp=True)
+        image, weight, notes = from_before(frame, state, channels=6, sharp=True)
         image, light = image.split(3, 1)
         albedo = frame.buffer(self.albedo)
         light = light if albedo is None else remodulate(light, albedo)
@@ -87,14 +87,12 @@ class Recurrent(Wrapper):
         handed = frame.replace(extra={**frame.extra, **before})
         output, _ = self.inner(handed)
         light = output.image if albedo is None else demodulate(output.image, albedo)
-        return output, to_be_kept(frame, torch.cat([output.image, light], 1))
+        return output.noted(*notes), to_be_kept(frame, torch.cat([output.image, light], 1))
 
 
 def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
     """The state for the next frame from an image ``(B, C, H, W)`` of this frame; ``None`` after the last frame."""
-    keeps = frame.hints.keep_all or not frame.hints.last
-    note("remember", "for the next frame" if keeps else "last frame", float(not keeps))
-    if not keeps:
+    if not _keeps(frame):
         return None
     surface = Surface(frame.position, frame.normal, frame.depth)
     return Before(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
@@ -102,7 +100,7 @@ def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
 
 def from_before(
     frame: Frame, state: State, channels: int, keeper: str = "recurrent", *, sharp: bool = False
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, tuple[Note, ...]]:
     """Reproject the previous image to this frame.
 
     Args:
@@ -114,7 +112,7 @@ def from_before(
 
     Returns:
         ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] the fraction that shows the same surface; both are
-        zero in a first frame, after a change of the image size, and without motion.
+        zero in a first frame, after a change of the image size, and without motion. Notes about the history.
 
     Raises:
         InputError: the state belongs to another method.
@@ -133,18 +131,22 @@ def from_before(
         whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps
         found = torch.where(whole, resample(before.image, motion), found)
     weight = weight * before.weight
-    _report("", None)
-    tell_history(weight.mean())
-    return found, weight
+    return found, weight, _notes(frame, "", weight.mean())
 
 
-def _nothing(frame: Frame, shape: tuple[int, ...], reset: str) -> tuple[Tensor, Tensor]:
+def _nothing(frame: Frame, shape: tuple[int, ...], reset: str) -> tuple[Tensor, Tensor, tuple[Note, ...]]:
     """The result of :func:`from_before` without a previous image, for the reason ``reset``."""
-    _report(reset, 0.0)
-    return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1])
+    return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1]), _notes(frame, reset, 0.0)
 
 
-def _report(reset: str, history: float | None) -> None:
-    if (found := journal()) is not None:
-        found.reset, found.history = reset, history
-        note("reproject", reset or "the image of the frame before", float(reset != ""))
+def _keeps(frame: Frame) -> bool:
+    return frame.hints.keep_all or not frame.hints.last
+
+
+def _notes(frame: Frame, reset: str, history: float | Tensor) -> tuple[Note, ...]:
+    keeps = _keeps(frame)
+    return (
+        Note("history", reset, value=history),
+        Note("reproject", reset or "the image of the frame before", float(reset != "")),
+        Note("remember", "for the next frame" if keeps else "last frame", float(not keeps)),
+    )

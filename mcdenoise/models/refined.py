@@ -21,8 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, Skip
-from mcdenoise.models._interface import Model, Needs, Output, State, prepared
-from mcdenoise.models._journal import note
+from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import FEATURES, features_of, image_statistics, input_of
@@ -130,7 +129,6 @@ class Refined(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        note("refine", "features and history")
         refined, _ = self.features(frame.replace(skip=None, layers={}))
         own = torch.ones_like(frame.color) if frame.albedo is None else modulation(frame.albedo)
         diffuse = refined.stages[DIFFUSE]
@@ -148,4 +146,5 @@ class Refined(Wrapper):
         output, state = self.inner(prepared(self.inner, changed), state)
         stages = {name: image * out for name, image in output.stages.items()}
         layers = {name: layer * out for name, layer in output.layers.items()}
-        return output._replace(image=output.image * out, stages=stages, layers=layers), state
+        output = output._replace(image=output.image * out, stages=stages, layers=layers)
+        return output.noted(Note("refine", "features and history")), state

@@ -15,7 +15,6 @@ import torch
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._journal import timed
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops._steps.residual import CELL, REACH, weight_of_noisy
 
@@ -32,6 +31,8 @@ class Restored(Wrapper):
         inner: any method.
     """
 
+    stage = "restore"
+
     @property
     def needs(self) -> Needs:
         """The needs of the inner method; windows add to its reach."""
@@ -42,8 +43,8 @@ class Restored(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         output, state = self.inner(frame, state)
-        with timed("restore", frame.color.device):
-            weight = weight_of_noisy(frame.color, output.image)
-            layers = {name: torch.lerp(layer, frame.layers[name], weight) for name, layer in output.layers.items()}
-            alpha = None if output.alpha is None or frame.alpha is None else output.alpha.lerp(frame.alpha, weight)
-            return Output(torch.lerp(output.image, frame.color, weight), output.stages, layers, alpha), state
+        weight = weight_of_noisy(frame.color, output.image)
+        layers = {name: torch.lerp(layer, frame.layers[name], weight) for name, layer in output.layers.items()}
+        alpha = None if output.alpha is None or frame.alpha is None else output.alpha.lerp(frame.alpha, weight)
+        image = torch.lerp(output.image, frame.color, weight)
+        return output._replace(image=image, layers=layers, alpha=alpha), state

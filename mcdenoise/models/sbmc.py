@@ -31,8 +31,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import note
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
 from mcdenoise.models._registry import register_model
@@ -96,7 +95,6 @@ class SbmcNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
-        note("samples", describe_samples(frame))
         known = with_context(*self.embedding(samples_input(frame, light)))
         mean, total = light[:, 0], None
         for sample, seen in zip(light.unbind(1), known.unbind(1), strict=True):
@@ -108,7 +106,7 @@ class SbmcNetwork(nn.Module):
                 # A running mean over the samples so far, weighted so that no exponential overflows.
                 mean = torch.lerp(mean, splat, torch.sigmoid(weight - total).to(mean.dtype))
                 total = torch.logaddexp(total, weight)
-        return answered(frame, mean), None
+        return answered(frame, mean).noted(Note("samples", describe_samples(frame))), None
 
 
 @register_model(

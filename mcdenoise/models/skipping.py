@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Skip
-from mcdenoise.models._interface import Model, Output, State
-from mcdenoise.models._journal import ask, journal, note, timed
+from mcdenoise.models._interface import Model, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._state import own_pair, own_state
@@ -84,6 +83,8 @@ class Skipping(Wrapper):
         InputError: the tolerance is negative or not finite.
     """
 
+    stage = "plan"
+
     def __init__(self, inner: Model, tolerance: float = TOLERANCE, alpha_min: float = 0.1) -> None:
         super().__init__(inner)
         if not 0 <= tolerance < math.inf:
@@ -98,22 +99,22 @@ class Skipping(Wrapper):
         still = frame.hints.still and self.tolerance > 0 and not frame.hints.keep_all
         # The color of a tile may have converged while light still moves between its layers.
         carries = bool(frame.layers) or alpha_of(frame) is not None
-        with timed("plan", current.device):
-            free = noise_free(frame)
-            _note("noise-free pixels", free, "background and emitters are copied", exact=True)
-            kept = self._decided(frame, current, before) if still and not carries else None
-            passed = None if kept is None else _pixels(kept.passed, frame.size)
-            reused = None if kept is None else _pixels(kept.reused, frame.size)
-            none = "layers or alpha are asked for" if still and carries else "there are none"
-            _note("converged tiles", passed, f"noise below {self.tolerance:g}", none, exact=False)
-            _note("unchanged tiles", reused, f"change below {self.tolerance:g}", none, exact=False)
-            images = {} if before is None else before.images
-            skip = _skip(free, passed, reused, current, frame.color, images)
-        with timed("network", current.device):
-            output, inner = self.inner(frame.replace(skip=skip), inner)
-            if skip is not None:
-                image = torch.where(skip.mask, skip.images["image"].to(output.image.dtype), output.image)
-                output = completed(frame, output._replace(image=image))
+        free = noise_free(frame)
+        kept = self._decided(frame, current, before) if still and not carries else None
+        passed = None if kept is None else _pixels(kept.passed, frame.size)
+        reused = None if kept is None else _pixels(kept.reused, frame.size)
+        none = "layers or alpha are asked for" if still and carries else "there are none"
+        images = {} if before is None else before.images
+        skip = _skip(free, passed, reused, current, frame.color, images)
+        output, inner = self.inner(frame.replace(skip=skip), inner)
+        if skip is not None:
+            image = torch.where(skip.mask, skip.images["image"].to(output.image.dtype), output.image)
+            output = completed(frame, output._replace(image=image))
+        output = output.noted(
+            _note("noise-free pixels", free, "background and emitters are copied", exact=True),
+            _note("converged tiles", passed, f"noise below {self.tolerance:g}", none, exact=False),
+            _note("unchanged tiles", reused, f"change below {self.tolerance:g}", none, exact=False),
+        )
         if frame.hints.last:
             kept = None
         elif kept is not None:
@@ -197,16 +198,10 @@ def _skip(
     return Skip(mask | free, {name: torch.where(free, current, image) for name, image in known.items()})
 
 
-def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are none", *, exact: bool) -> None:
-    note(name, none, exact=exact)
-    if (found := journal()) is None or pixels is None:
-        return
-    total = pixels.numel()
-
-    def tell(count: Sequence[float]) -> None:
-        found.note(name, reason if count[0] else none, count[0] / total, exact=exact)
-
-    ask(pixels.count_nonzero(), tell)
+def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are none", *, exact: bool) -> Note:
+    if pixels is None:
+        return Note(name, none, exact=exact)
+    return Note(name, reason, pixels.count_nonzero() / pixels.numel(), otherwise=none, exact=exact)
 
 
 def _change(color: Tensor, weight: Tensor, old_color: Tensor, old_weight: Tensor, tile: int) -> Tensor:

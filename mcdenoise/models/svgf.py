@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._journal import journal, timed
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
@@ -101,41 +100,44 @@ class Svgf(nn.Module):
         entering = with_carried(frame)
         history = own_state(state, History, frame, channels=entering.shape[1])
         normal, depth = frame.normal, frame.depth
-        with timed("accumulate", frame.color.device):
-            light, moments, length = self._accumulate(frame, entering, history)
-            variance = variance_of(moments, length, frame)
+        reset, motion = self._reset(frame, history)
+        light, moments, length = self._accumulate(frame, entering, None if reset else history, motion)
+        variance = variance_of(moments, length, frame)
         filtered, kept = light, light
-        with timed("filter", frame.color.device):
-            for level in range(self.levels):
-                # Eqs. 1 and 2.
-                filtered, variance = atrous(
-                    filtered,
-                    variance,
-                    normal,
-                    depth,
-                    step=1 << level,
-                    sigma_z=self.sigma_z,
-                    sigma_n=self.sigma_n,
-                    sigma_l=self.sigma_l,
-                )
-                # Sec. 4.3: the first level feeds the history.
-                kept = filtered if level == 0 else kept
+        for level in range(self.levels):
+            # Eqs. 1 and 2.
+            filtered, variance = atrous(
+                filtered,
+                variance,
+                normal,
+                depth,
+                step=1 << level,
+                sigma_z=self.sigma_z,
+                sigma_n=self.sigma_n,
+                sigma_l=self.sigma_l,
+            )
+            # Sec. 4.3: the first level feeds the history.
+            kept = filtered if level == 0 else kept
         surface = Surface(frame.position, normal, depth)
         after = History(kept, moments, length, surface, frame.view_projection)
-        output = answered(frame, filtered)
+        output = answered(frame, filtered).noted(Note("history", reset))
         return output._replace(stages={"accumulated": light[:, :3]}), after
 
-    def _accumulate(self, frame: Frame, light: Tensor, history: History | None) -> tuple[Tensor, Tensor, Tensor]:
+    def _reset(self, frame: Frame, history: History | None) -> tuple[str, Tensor | None]:
+        """Why the history is discarded, empty if it is used; and the motion since the frame before."""
+        if history is None:
+            return "first frame", None
+        motion = motion_to_previous(frame, history.view_projection)
+        if history.length.shape != frame.color[:, :1].shape:
+            return "size change", motion
+        return "" if motion is not None else "no motion", motion
+
+    def _accumulate(
+        self, frame: Frame, light: Tensor, history: History | None, motion: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
         entering = torch.cat([light, luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
-        reset, motion = "first frame", None
-        if history is not None:
-            motion = motion_to_previous(frame, history.view_projection)
-            alike = history.length.shape == light[:, :1].shape
-            reset = "size change" if not alike else "" if motion is not None else "no motion"
-        if (found := journal()) is not None:
-            found.reset = reset
-        if reset or history is None:
+        if history is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
         both, length = self._blend(frame, entering, history, motion)
         return both[:, :-2], both[:, -2:], length

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models._interface import Model, Output, State, prepared
-from mcdenoise.models._journal import note
+from mcdenoise.models._interface import Model, Note, Output, State, prepared
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops._window import mirrored
@@ -74,16 +73,18 @@ class Tiled(Wrapper):
         """See :class:`mcdenoise.models.Model`."""
         parts = self._parts(frame)
         if parts is None:
-            note("network", "on 100% of the pixels")
-            return self._within(Region(0, 0, *frame.size), frame.replace(skip=None), state)
+            output, state = self._within(Region(0, 0, *frame.size), frame.replace(skip=None), state)
+            return output.noted(Note("network", "on 100% of the pixels")), state
         frame = frame if frame.statistics else prepared(self.inner, frame)
         results: dict[str, Tensor] = {}
+        notes: Sequence[Note] = ()
         halo = self.halo or 0
         for part in parts:
             around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
             output, after = self._within(around, frame)
             if after is not None:
                 raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
+            notes = output.notes
             layers = {_LAYER + name: layer for name, layer in output.layers.items()}
             alpha = {} if output.alpha is None else {_ALPHA: output.alpha}
             for name, image in {"image": output.image, **output.stages, **layers, **alpha}.items():
@@ -91,11 +92,11 @@ class Tiled(Wrapper):
                     results[name] = _known(frame, name).to(image.dtype, copy=True)
                 kept.of(results[name]).copy_(kept.within(around).of(image))
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
-        note("network", f"on {computed:.0%} of the pixels", 1 - computed)
+        note = Note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         image = results.pop("image") if results else _known(frame, "image")
         covered = results.pop(_ALPHA) if _ALPHA in results else None
         layers = {name: results.pop(_LAYER + name) for name in frame.layers if _LAYER + name in results}
-        return Output(image, results, layers, covered), None
+        return Output(image, results, layers, covered, notes).noted(note), None
 
     def _within(self, around: Region, frame: Frame, state: State = None) -> tuple[Output, State]:
         """The method on a rectangle of the frame, with a mirror image on those sides where the frame ends."""
@@ -117,7 +118,7 @@ class Tiled(Wrapper):
 
         output, state = self.inner(seen.map(bordered), state)
         inside = Region(top, left, top + around.bottom - around.top, left + around.right - around.left)
-        return Output(*pytree.tree_map_only(Tensor, lambda image: inside.of(image).contiguous(), tuple(output))), state
+        return output.map(lambda image: inside.of(image).contiguous()), state
 
     def _parts(self, frame: Frame) -> list[Region] | None:
         """The tiles to compute; ``None`` for the whole image at once."""

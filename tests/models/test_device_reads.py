@@ -15,16 +15,15 @@ from typing import Any
 import kornia  # noqa: F401 - makes constants when it is first imported
 import pytest
 import torch
+from reads import without_reads
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from toys import Same, refused, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
-from mcdenoise.models import Accumulated, Demodulated, Journal, Output, list_models, listening, timed
-from mcdenoise.models import _journal as journal_module
-from mcdenoise.models._journal import ask
-from mcdenoise.models._reads import at_hand, without_reads
+from mcdenoise.models import Accumulated, Demodulated, Output, Report, _report, _times, list_models
 from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Times
 
 # Open Image Denoise is a library for processors here: images go there and back, which waits.
 ON_THE_HOST = {"oidn", "oidn_temporal"}
@@ -266,31 +265,29 @@ class Behind(Stopwatch):
 
 
 def test_stages_are_timed_without_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_module, "Stopwatch", Behind)
+    monkeypatch.setattr(_times, "Stopwatch", Behind)
     monkeypatch.setattr(Event, "waits", 0)
-    found, device = Journal(), torch.device("cpu")
+    times = Times(torch.device("cpu"))
     start = time.perf_counter()
-    with listening(found), timed("outer", device):
+    with times.of("outer"):
         time.sleep(0.02)
         for _ in range(2):
-            with timed("inner", device):
+            with times.of("inner"):
                 time.sleep(0.03)
     whole = (time.perf_counter() - start) * 1e3
-    assert (Event.waits, found.milliseconds) == (0, {})
-    found.settle()
+    assert Event.waits == 0
+    found = times.milliseconds()
     assert Event.waits > 0
-    assert set(found.milliseconds) == {"outer", "inner"}
     # Each counts what is its own; a sleep is never shorter than it was asked for.
-    assert found.milliseconds["outer"] >= 20
-    assert found.milliseconds["inner"] >= 60
-    assert sum(found.milliseconds.values()) <= whole
-    before = dict(found.milliseconds)
-    found.settle()
-    assert found.milliseconds == before
+    assert found["outer"] >= 20
+    assert found["inner"] >= 60
+    assert sum(found.values()) <= whole
+    assert set(found) == {"outer", "inner"}
 
 
 def test_a_streamed_frame_waits_for_no_mark(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_module, "Stopwatch", Behind)
+    monkeypatch.setattr(_times, "Stopwatch", Behind)
+    monkeypatch.setattr(_report, "Stopwatch", Behind)
     model = small("cascaded_v2_micro")
     denoiser = Denoiser(model)
     frames = shot(model, 2)
@@ -311,11 +308,11 @@ def test_all_are_told_before_one_that_fails_is_heard() -> None:
         told.append(list(numbers))
         raise InputError("no")
 
-    found = Journal()
-    with without_reads(), listening(found):
-        assert not at_hand(torch.device("cpu"))
-        ask(torch.tensor([1.0, 2.0]), refuse)
-        ask(torch.tensor(True), lambda numbers: told.append(list(numbers)))
+    found = Report()
+    with without_reads():
+        found.ask(torch.tensor([1.0, 2.0]), refuse)
+        found.ask(torch.tensor(True), lambda numbers: told.append(list(numbers)))
         assert not told
+        found.send()
     assert refused(found.settle) == "no"
     assert told == [[1.0, 2.0], [1.0]]

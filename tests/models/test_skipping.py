@@ -10,19 +10,18 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Blur, Mean, Same, Shot, Watching, refused, small
+from toys import Blur, Mean, Same, Shot, Watching, refused, report_of, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.models import (
     Accumulated,
     Chain,
     Demodulated,
-    Journal,
     Output,
+    Report,
     Skipping,
     Stage,
     Tiled,
-    listening,
     parts_of,
     summarize,
 )
@@ -332,35 +331,33 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
 # Methods that know nothing of it
 
 
-def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], Journal]:
+def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], Report]:
     """Images of a shot, and what was reported of its last frame."""
-    state, outputs, journal = None, [], Journal()
+    state, outputs = None, []
     for frame in frames:
-        journal = Journal()
-        with listening(journal):
-            output, state = model(frame.replace(hints=frame.hints._replace(**hints)), state)
+        output, state = model(frame.replace(hints=frame.hints._replace(**hints)), state)
         outputs.append(output)
-    return outputs, journal
+    return outputs, report_of(outputs[-1])
 
 
 def test_only_tiles_with_noise_are_computed() -> None:
     frame, toy = sky(wall(0), 90), Blur()
     model = Skipping(Tiled(toy))
     expected, _ = Blur()(frame)
-    [output], journal = shot_of(model, [frame])
+    [output], report = shot_of(model, [frame])
     assert torch.equal(output.image[..., 90:, :], expected.image[..., 90:, :])
     assert torch.equal(output.image[..., :90, :], frame.color[..., :90, :])
     # It reads the rows from 64, a multiple of 32, and the two rows above them.
     assert toy.pixels == (HEIGHT - 64 + 2) * WIDTH
-    assert journal.stages["network"].skipped == pytest.approx(64 / HEIGHT)
-    assert journal.stages["noise-free pixels"] == Stage(
+    assert report.stages["network"].skipped == pytest.approx(64 / HEIGHT)
+    assert report.stages["noise-free pixels"] == Stage(
         "noise-free pixels", pytest.approx(90 / HEIGHT), "background and emitters are copied"
     )
     toy.pixels = 0
     frame = sky(wall(0), HEIGHT)
-    [output], journal = shot_of(model, [frame])
+    [output], report = shot_of(model, [frame])
     assert torch.equal(output.image, frame.color)
-    assert (toy.pixels, journal.stages["network"].skipped) == (0, 1)
+    assert (toy.pixels, report.stages["network"].skipped) == (0, 1)
 
 
 def test_a_batch_needs_what_any_of_its_images_needs() -> None:
@@ -383,9 +380,9 @@ def test_reused_and_passed_tiles_of_a_toy_are_not_computed() -> None:
         color = 1 + 0.002 * (draw(number) - 0.5)
         color[..., 130:140, 200:210] = 1 + draw(number)[..., :10, :10]
         frames.append(wall(0).replace(color=color, albedo=None))
-    outputs, journal = shot_of(model, frames)
-    assert journal.stages["converged tiles"].skipped == pytest.approx(34 / 35)
-    assert not journal.stages["converged tiles"].exact
+    outputs, report = shot_of(model, frames)
+    assert report.stages["converged tiles"].skipped == pytest.approx(34 / 35)
+    assert not report.stages["converged tiles"].exact
     last = outputs[-1]
     assert torch.equal(last.image[..., :128, :], last.stages["accumulated"][..., :128, :])
     assert not torch.equal(last.image[..., 128:, 192:], last.stages["accumulated"][..., 128:, 192:])
@@ -396,17 +393,17 @@ def test_reused_and_passed_tiles_of_a_toy_are_not_computed() -> None:
     assert counts - toy.pixels == 34 * 34
     # A renderer at rest repeats its frame: its noise cannot be told, but nothing changes any more.
     toy.pixels, repeated = 0, [wall(0).replace(albedo=None)] * 20
-    outputs, journal = shot_of(model, repeated)
-    assert journal.stages["unchanged tiles"].skipped == 1
-    assert journal.stages["network"].skipped == 1
+    outputs, report = shot_of(model, repeated)
+    assert report.stages["unchanged tiles"].skipped == 1
+    assert report.stages["network"].skipped == 1
     assert toy.pixels == 15 * HEIGHT * WIDTH
     assert torch.equal(outputs[-1].image, outputs[14].image)
 
 
 def test_stages_are_reused_with_the_image() -> None:
     model = Accumulated(Skipping(Chain(initial=Tiled(Blur()), final=Tiled(Blur()))))
-    outputs, journal = shot_of(model, [wall(0).replace(albedo=None)] * 20)
-    assert journal.stages["network"].skipped == 1
+    outputs, report = shot_of(model, [wall(0).replace(albedo=None)] * 20)
+    assert report.stages["network"].skipped == 1
     assert list(outputs[-1].stages) == ["accumulated", "initial"]
     for one, other in zip(outputs[-1].stages.values(), outputs[14].stages.values(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
@@ -417,8 +414,8 @@ def test_stages_are_reused_with_the_image() -> None:
 def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:
     toy = Blur()
     frames = [sky(wall(0), 96).replace(albedo=None)] * 20
-    outputs, journal = shot_of(Accumulated(Skipping(Tiled(toy))), frames, keep_all=True)
-    assert {name for name, one in journal.stages.items() if one.skipped} == {"noise-free pixels"}
+    outputs, report = shot_of(Accumulated(Skipping(Tiled(toy))), frames, keep_all=True)
+    assert {name for name, one in report.stages.items() if one.skipped} == {"noise-free pixels"}
     assert toy.pixels == 20 * HEIGHT * WIDTH
     assert torch.equal(outputs[-1].image[..., :96, :], frames[0].color[..., :96, :])
 
@@ -427,8 +424,8 @@ def test_a_recurrent_method_keeps_its_state_beside_skipped_pixels() -> None:
     """Where there is no state, it is as it is without; at a cut it begins anew, and so does the stored image."""
     frames = [wall(number) for number in range(10)]
     frames.append(frames[-1].replace(normal=-frames[-1].normal))
-    outputs, journal = shot_of(Accumulated(Skipping(Mean()), alpha_min=1.0), frames)
-    assert journal.reset == "cut"
+    outputs, report = shot_of(Accumulated(Skipping(Mean()), alpha_min=1.0), frames)
+    assert report.reset == "cut"
     expected, _ = shot_of(Accumulated(Mean(), alpha_min=1.0), frames)
     for output, other in zip(outputs, expected, strict=True):
         torch.testing.assert_close(output.image, other.image)

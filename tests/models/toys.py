@@ -16,15 +16,21 @@ from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models import (
     Accumulated,
     Demodulated,
-    Journal,
     Model,
     Needs,
     Output,
+    Report,
     create_model,
     find_model,
-    listening,
 )
 from mcdenoise.ops._backend import Backend
+
+
+def report_of(output: Output) -> Report:
+    """What the notes of a step tell."""
+    report = Report()
+    report.add(output.notes)
+    return report
 
 
 def refused(action: Callable[[], object]) -> str:
@@ -185,15 +191,13 @@ class Shot:
         self.state = None
 
     def update(self, frame: Frame, **hints: bool) -> Seen:
-        journal = Journal()
-        with listening(journal):
-            frame = frame.replace(hints=frame.hints._replace(**hints))
-            if self.backend is None:
-                _, self.state = self.model(frame, self.state)
-            else:
-                with ops.use(self.backend, strict=False):
-                    _, self.state = self.model(frame, self.state)
+        frame = frame.replace(hints=frame.hints._replace(**hints))
+        if self.backend is None:
+            output, self.state = self.model(frame, self.state)
+        else:
+            with ops.use(self.backend, strict=False):
+                output, self.state = self.model(frame, self.state)
         seen = self.watching.frames[-1]
         assert seen.current is not None
         assert seen.length is not None
-        return Seen(seen.color, seen.current, seen.length, journal.reset)
+        return Seen(seen.color, seen.current, seen.length, report_of(output).reset)

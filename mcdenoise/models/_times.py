@@ -1,0 +1,115 @@
+"""Run times of the parts of a method, as hooks on its modules see them from outside."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import torch
+from torch import nn
+
+from mcdenoise.models._interface import Model
+from mcdenoise.models._stopwatch import Moment, Stopwatch
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.oidn import Oidn
+
+
+@dataclass
+class _Span:
+    """Start and end of one run of a stage, with those inside it."""
+
+    stage: str
+    start: Moment
+    end: Moment = None
+    within: list[_Span] = field(default_factory=list)
+
+
+class Times:
+    """Run times of the stages of one frame, each without the stages inside it.
+
+    The host does not wait for a GPU: the GPU records the times itself, and :meth:`milliseconds` reads them.
+
+    Args:
+        device: where the stages run.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._watch, self._thread = Stopwatch(device), threading.get_ident()
+        self._open: list[_Span] = []
+        self._spans: list[_Span] = []
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Measure what runs inside this block."""
+        span = self._begin(stage)
+        try:
+            yield
+        finally:
+            self._end()
+            self._spans.append(span)
+
+    @contextmanager
+    def of_modules(self, model: Model, name: str) -> Iterator[None]:
+        """Measure each wrapper of a model, and the methods inside, while they run inside this block.
+
+        Args:
+            model: any.
+            name: the stage of methods without weights.
+        """
+        handles = []
+        for module, stage in _stages(model, name):
+
+            def begin(*_: object, stage: str = stage) -> None:
+                # Another thread may run the same module for a denoiser of its own.
+                if threading.get_ident() == self._thread:
+                    self._spans.append(self._begin(stage))
+
+            def end(*_: object) -> None:
+                if threading.get_ident() == self._thread:
+                    self._end()
+
+            handles += [
+                module.register_forward_pre_hook(begin),
+                module.register_forward_hook(end, always_call=True),
+            ]
+        try:
+            yield
+        finally:
+            for handle in handles:
+                handle.remove()
+
+    def milliseconds(self) -> dict[str, float]:
+        """The times by stage, in the order of their beginning; a block's is at its end. Waits for a GPU."""
+        found: dict[str, float] = {}
+        for span in self._spans:
+            inside = sum(self._watch.between(each.start, each.end) for each in span.within)
+            found[span.stage] = found.get(span.stage, 0.0) + self._watch.between(span.start, span.end) - inside
+        return found
+
+    def _begin(self, stage: str) -> _Span:
+        span = _Span(stage, self._watch.mark())
+        if self._open:
+            self._open[-1].within.append(span)
+        self._open.append(span)
+        return span
+
+    def _end(self) -> None:
+        self._open.pop().end = self._watch.mark()
+
+
+def _stages(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
+    """The wrappers of a model, and the methods inside, with the names of their stages; no method without a wrapper."""
+    for part in model.modules() if isinstance(model, nn.Module) else ():
+        if isinstance(part, Wrapper):
+            inner = part.inner
+            if isinstance(inner, Wrapper) or not isinstance(inner, nn.Module):
+                yield part, part.stage
+                continue
+            learnt = isinstance(inner, Oidn) or next(inner.parameters(), None) is not None
+            method = "network" if learnt else name
+            # Demodulated calls what is inside without its hooks, and takes hardly any time itself.
+            yield part, method if isinstance(part, Demodulated) else part.stage
+            yield inner, method
