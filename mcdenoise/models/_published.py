@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +15,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.exposed import Exposed
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import remodulate
 
@@ -22,16 +26,21 @@ _DARKEST = 1e-6
 
 
 def as_published(
-    method: Model, alpha_min: float, position_limit: float, normal_limit: float, *, also: Sequence[str] = ()
+    method: Model,
+    alpha_min: float = 0.2,
+    position_limit: float = POSITION_LIMIT,
+    normal_limit: float = NORMAL_LIMIT,
 ) -> Model:
     """Wrap a method with demodulation and the published accumulation rule (Koskela et al. 2019), and nothing else.
 
+    Diffuse and specular light are accumulated for a method that uses them.
+
     Args:
         method: any.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points count as the same point.
+        alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
+        position_limit: squared distance in scene units below which two points count as the same point, see
+            :func:`mcdenoise.ops.reproject`.
         normal_limit: the same for normals.
-        also: see :class:`mcdenoise.models.Accumulated`.
     """
     return Demodulated(
         Accumulated(
@@ -43,9 +52,29 @@ def as_published(
             firefly_limit=float("inf"),
             specular_length=float("inf"),
             lag_threshold=float("inf"),
-            also=also,
+            also=[part for part in ("diffuse", "specular") if part in method.needs.uses],
         )
     )
+
+
+def published(network: Callable[..., Model]) -> Callable[..., Model]:
+    """Put the network that a function makes behind exposure and :func:`as_published`, with its settings by keyword.
+
+    A model's settings are then those of the function, which determine its weights, and ``alpha_min``,
+    ``position_limit`` and ``normal_limit``.
+    """
+
+    @functools.wraps(network)
+    def made(*sizes: Any, **named: Any) -> Model:
+        history = {name: named.pop(name) for name in accumulation if name in named}
+        return as_published(Exposed(network(*sizes, **named)), **history)
+
+    _, *settings = inspect.signature(as_published).parameters.values()
+    accumulation = {each.name: each.replace(kind=each.KEYWORD_ONLY) for each in settings}
+    own = inspect.signature(network)
+    signature = own.replace(parameters=[*own.parameters.values(), *accumulation.values()])
+    made.__signature__ = signature  # type: ignore[attr-defined]
+    return made
 
 
 def check_odd(kernel_size: int) -> None:

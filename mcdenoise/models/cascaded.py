@@ -26,11 +26,10 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published
+from mcdenoise.models._published import TenChannels, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import FusionModule
 from mcdenoise.nn.unet import Head, UNet
@@ -152,16 +151,13 @@ class _NonNegative(Wrapper):
     kind="kernel",
     paper="DOI 10.1007/s00371-023-02951-6",
 )
+@published
 def cascaded(
     width: int = 40,
     kernel_size: int = 5,
     cascade: str = "P+K",
     bilateral: bool = True,
     normalize: Normalize = "softmax",
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
 ) -> Model:
     """The paper's network, and its ablations.
 
@@ -171,10 +167,6 @@ def cascaded(
         cascade: ``"P+K"`` as in the paper, or ``"K"``, ``"P"``, ``"K+P"``, ``"K+K"`` as in its Table 3.
         bilateral: whether features adjust the kernels, see its Table 4.
         normalize: see :class:`KernelNetwork`.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points count as the same point, see
-            :func:`mcdenoise.ops.reproject`.
-        normal_limit: the same for normals.
 
     Raises:
         InputError: there is no such cascade.
@@ -186,5 +178,4 @@ def cascaded(
         for part in cascade.split("+")
     ]
     networks[-1] = _NonNegative(networks[-1])
-    chain = Chain(**dict(zip(("initial", "final")[-len(networks) :], networks, strict=True)))
-    return as_published(Exposed(chain), alpha_min, position_limit, normal_limit)
+    return Chain(**dict(zip(("initial", "final")[-len(networks) :], networks, strict=True)))

@@ -14,9 +14,8 @@ from torch import nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
+from mcdenoise.models._published import TenChannels, check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.mrkp import Backbone, with_glorot
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import cross_bilateral_filter
@@ -59,21 +58,12 @@ class KpNetwork(TenChannels):
     kind="kernel",
     paper="after Bako et al. 2017",
 )
-def kp(
-    width: int = 48,
-    kernel_size: int = 13,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def kp(width: int = 48, kernel_size: int = 13) -> Model:
     """Kernel prediction with one kernel at full resolution, behind the published accumulation.
 
     Args:
         width: channels of every convolution.
         kernel_size: k of the kernels, odd.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
     """
-    return as_published(Exposed(Tiled(KpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)
+    return Tiled(KpNetwork(width, kernel_size))

@@ -44,9 +44,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
+from mcdenoise.models._published import check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.svgf import BRIGHTEST
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
@@ -161,16 +160,8 @@ def _seen(image: Tensor, frame: Frame) -> Tensor:
     kind="kernel",
     paper="Bako et al. 2017",
 )
-def kpcn(
-    width: int = 24,
-    layers: int = 5,
-    kernel_size: int = 11,
-    split: bool = True,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def kpcn(width: int = 24, layers: int = 5, kernel_size: int = 11, split: bool = True) -> Model:
     """KPCN of Bako et al. 2017; ``kpcn(**PUBLISHED)`` has the paper's sizes.
 
     Args:
@@ -178,10 +169,5 @@ def kpcn(
         layers: likewise.
         kernel_size: likewise.
         split: likewise.
-        alpha_min: smallest weight of the current frame in the accumulation; 1 for the paper's single images.
-        position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
-        normal_limit: likewise.
     """
-    network = Exposed(Tiled(KpcnNetwork(width, layers, kernel_size, split)))
-    also = ("diffuse", "specular") if split else ()
-    return as_published(network, alpha_min, position_limit, normal_limit, also=also)
+    return Tiled(KpcnNetwork(width, layers, kernel_size, split))

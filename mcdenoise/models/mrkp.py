@@ -26,9 +26,8 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, check_odd
+from mcdenoise.models._published import TenChannels, check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
@@ -183,21 +182,12 @@ def aligned(image: Tensor, height: int, width: int) -> Tensor:
 @register_model(
     "mrkp", "5x5 kernels at three scales, as in Meng's code of 2020", kind="kernel", paper="Vogels et al. 2018"
 )
-def mrkp(
-    width: int = 48,
-    kernel_size: int = 5,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def mrkp(width: int = 48, kernel_size: int = 5) -> Model:
     """Kernel prediction at several scales, behind the published accumulation.
 
     Args:
         width: channels of every convolution.
         kernel_size: k of the kernels, odd.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
     """
-    return as_published(Exposed(Tiled(MrkpNetwork(width, kernel_size))), alpha_min, position_limit, normal_limit)
+    return Tiled(MrkpNetwork(width, kernel_size))

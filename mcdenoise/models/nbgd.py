@@ -41,9 +41,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
+from mcdenoise.models._published import TenChannels, displayed, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import grid_slice, grid_splat
 
@@ -136,20 +135,11 @@ def _sum(weights: Sequence[Tensor], images: Sequence[Tensor]) -> Tensor:
 @register_model(
     "nbgd", "three bilateral grids on guides that a network of 7 layers draws", kind="grid", paper="Meng et al. 2020"
 )
-def nbgd(
-    layers: int = 7,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def nbgd(layers: int = 7) -> Model:
     """The neural bilateral grid on accumulated and demodulated radiance.
 
     Args:
         layers: see :class:`NeuralBilateralGrid`.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: squared distance in scene units below which two points count as the same point, see
-            :func:`mcdenoise.ops.reproject`.
-        normal_limit: the same for normals.
     """
-    return as_published(Exposed(Tiled(NeuralBilateralGrid(layers))), alpha_min, position_limit, normal_limit)
+    return Tiled(NeuralBilateralGrid(layers))

@@ -33,9 +33,8 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published, check_odd
+from mcdenoise.models._published import check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
@@ -115,16 +114,8 @@ class SbmcNetwork(nn.Module):
     kind="kernel",
     paper="Gharbi et al. 2019",
 )
-def sbmc(
-    width: int = 16,
-    rounds: int = 3,
-    convolutions: int = 2,
-    kernel_size: int = 11,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def sbmc(width: int = 16, rounds: int = 3, convolutions: int = 2, kernel_size: int = 11) -> Model:
     """SBMC of Gharbi et al. 2019; ``sbmc(**PUBLISHED)`` has the sizes of their code.
 
     Args:
@@ -132,9 +123,5 @@ def sbmc(
         rounds: likewise.
         convolutions: likewise.
         kernel_size: likewise.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: see :func:`mcdenoise.models.cascaded.cascaded`.
-        normal_limit: likewise.
     """
-    network = Exposed(Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size)))
-    return as_published(network, alpha_min, position_limit, normal_limit)
+    return Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size))

@@ -30,9 +30,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, TenChannels, as_published, displayed
+from mcdenoise.models._published import TenChannels, displayed, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import importance_filter
 
@@ -125,24 +124,15 @@ def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[i
 @register_model(
     "wskp", "kernels of shared weights, 3x3 to 13x13, as in its public code", kind="kernel", paper="Fan et al. 2021"
 )
-def wskp(
-    width: int = 14,
-    layers: int = 6,
-    *,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
+@published
+def wskp(width: int = 14, layers: int = 6) -> Model:
     """Kernel prediction with shared weights, behind the published accumulation.
 
     Args:
         width: channels between the convolutions.
         layers: number of convolutions: 6, or 3 as in the smaller network of the public code.
-        alpha_min: smallest weight of the current frame in the accumulation.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise for normals.
 
     Raises:
         InputError: there are fewer than two layers.
     """
-    return as_published(Exposed(Tiled(WskpNetwork(width, layers))), alpha_min, position_limit, normal_limit)
+    return Tiled(WskpNetwork(width, layers))
