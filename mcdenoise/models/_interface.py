@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 from torch import Tensor
 
 from mcdenoise.frame import Frame
+from mcdenoise.nn.unet import Live
 
 # Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
@@ -72,6 +73,10 @@ class Output(NamedTuple):
         return self._replace(notes=(*notes, *self.notes))
 
 
+# Some 64 feature channels and the images around them.
+_DEFAULT = Live(0, 64 + 54)
+
+
 @dataclass(frozen=True)
 class Needs:
     """The requirements of a method for its frames and its host.
@@ -85,6 +90,7 @@ class Needs:
             if the result depends on the whole image, so that tiles can neither be computed separately nor skipped.
         stride: a crop of the image gives the same pixels as the whole image if it begins at a multiple of ``stride``
             pixels, such as the side of a pixel of a U-Net's coarsest level.
+        live: the memory of a tile (:class:`mcdenoise.models.Tiled`), which decides how large tiles may be.
     """
 
     buffers: frozenset[str] = frozenset({"color"})
@@ -92,6 +98,7 @@ class Needs:
     trainable: bool = True
     reach: int | None = None
     stride: int = 1
+    live: Live = _DEFAULT
 
     def missing(self, frame: Frame) -> list[str]:
         """Sorted names of the required buffers that a frame lacks."""

@@ -111,7 +111,7 @@ class Division:
 
     def _network(self, frames: Frames) -> Network:
         halo = max(tiled.halo or 0 for tiled in self._tiled)
-        return Network(halo, max(tiled.bytes_per_pixel(bfloat16=frames.bfloat16) for tiled in self._tiled))
+        return Network(halo, max(tiled.inner.needs.live.bytes(bfloat16=frames.bfloat16) for tiled in self._tiled))
 
 
 class Memory:

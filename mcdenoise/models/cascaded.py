@@ -57,11 +57,9 @@ class _Network(TenChannels):
         """The reach adds a pixel for head and fusion and the filter's radius, at each scale, to that of the U-Net."""
         ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(self.unet.scales))
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
+        return Needs(
+            uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple, live=self.unet.live
+        )
 
     def fuse(self, images: list[Tensor]) -> Tensor:
         """Fuse the scales of an image, finest first."""

@@ -63,16 +63,12 @@ class _Network(nn.Module):
         heads = (max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
         ways = (self.unet.reach(scale) + head + (self._radius << scale) for scale, head in enumerate(heads))
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
-        return Needs(uses=_USES, reach=reach, stride=self.unet.multiple)
+        return Needs(uses=_USES, reach=reach, stride=self.unet.multiple, live=self.unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure, depth scale, and the logarithm of the brightest pixel of this network's own input."""
         found = image_statistics(frame)
         return found | {"maximum": torch.log1p(frame.color.amax((1, 2, 3), keepdim=True) * found["exposure"])}
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`; measured per channel of width."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
 
 class PixelNetwork(_Network):

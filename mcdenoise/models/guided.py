@@ -21,10 +21,11 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.joint_bilateral import guide_of, guide_statistics
 from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.unet import Live
 
 DEPTH_SCALE = 10.0
-# Memory for each pixel of a tile, measured: its covariance matrix of seven guides, and the solver.
-_BYTES_PER_PIXEL = 4 * 6 * 7**2
+# Numbers for each pixel of a tile, measured: its covariance matrix of seven guides, and the solver.
+_LIVE = Live(0, 6 * 7**2)
 
 
 class Guided(nn.Module):
@@ -54,15 +55,11 @@ class Guided(nn.Module):
     @property
     def needs(self) -> Needs:
         """Color; features guide. A pixel sees all windows that it lies in."""
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=2 * self.radius)
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=2 * self.radius, live=_LIVE)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """See :func:`mcdenoise.models.joint_bilateral.guide_statistics`."""
         return guide_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes."""
-        return float(_BYTES_PER_PIXEL)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -20,6 +20,7 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
 from mcdenoise.nn.inputs import auto_exposure, scale_of_depth
+from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import normalized_depth
 
@@ -56,7 +57,9 @@ class JointBilateral(nn.Module):
     @property
     def needs(self) -> Needs:
         """Color; features guide."""
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius)
+        # Its windows, unfolded, and as much again for their weights' derivatives.
+        live = Live(0, 2 * _CHANNELS * (2 * self.radius + 1) ** 2)
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius, live=live)
 
     @property
     def side(self) -> int:
@@ -67,10 +70,6 @@ class JointBilateral(nn.Module):
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """See :func:`guide_statistics`."""
         return guide_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes: its windows, unfolded, and as much again for their weights' derivatives."""
-        return 2 * 4 * _CHANNELS * float((2 * self.radius + 1) ** 2)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -49,7 +49,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models.svgf import BRIGHTEST
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
-from mcdenoise.nn.unet import bytes_of
+from mcdenoise.nn.unet import Live
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
 
 PUBLISHED: Mapping[str, Any] = {"width": 100, "layers": 9, "kernel_size": 21}
@@ -107,15 +107,11 @@ class KpcnNetwork(nn.Module):
         """Uses features, and diffuse and specular light."""
         uses = frozenset({"albedo", "normal", "depth"})
         parts = frozenset({"diffuse", "specular", "emission"} if self.specular is not None else ())
-        return Needs(uses=uses | parts, reach=self._reach)
+        return Needs(uses=uses | parts, reach=self._reach, live=Live(self._live))
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The depth scale of the whole image."""
         return image_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`: features, logits, weights, buffers."""
-        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -44,6 +44,7 @@ from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import TenChannels, displayed, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.unet import Live
 from mcdenoise.ops import grid_slice, grid_splat
 
 # Cell size s_s in pixels and 256 / s_r bins of the three grids, in the order of the guides.
@@ -51,8 +52,8 @@ GRIDS = ((4, 64), (8, 32), (16, 16))
 _INPUTS, _FIRST, _GROWTH, _OUTPUTS, _SLOPE = 10, 20, 5, 5, 0.2
 # Largest derivative in a guide, in training.
 _LARGEST = 100.0
-# Peak bytes per pixel of network and finest grid in float32; 920 were measured, including the frame.
-_BYTES_PER_PIXEL = 1100
+# Peak numbers per pixel of network and finest grid, always in float32; 230 were measured, including the frame.
+_LIVE = Live(0, 275)
 
 
 class NeuralBilateralGrid(TenChannels):
@@ -80,11 +81,7 @@ class NeuralBilateralGrid(TenChannels):
         """The reach is two pixels per convolution, plus the distance via a cell's centre to its farthest pixel."""
         coarsest = max(cell for cell, _ in GRIDS)
         reach = 2 * (2 + len(self.dense)) + 2 * coarsest
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=coarsest)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`; grids are always in float32."""
-        return _BYTES_PER_PIXEL
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=coarsest, live=_LIVE)
 
     def predicted(self, frame: Frame) -> Tensor:
         """Three guides and two weights, ``(B, 5, H, W)`` in [0, 1]."""

@@ -60,7 +60,7 @@ class Oidn(nn.Module):
         self._device.commit()
         self._check_device()
         self._filters: dict[tuple[tuple[str, ...], Quality, bool], Any] = {}
-        self._buffers: dict[str, Tensor] = {}
+        self._images: dict[str, Tensor] = {}
         # Filters must be released before their device, and both before the library.
         weakref.finalize(self, _release, self._filters, self._device)
 
@@ -137,17 +137,17 @@ class Oidn(nn.Module):
         results = []
         for index in range(batch):
             for name, image in images.items():
-                self._buffers[name].copy_(image[index].permute(1, 2, 0))
+                self._images[name].copy_(image[index].permute(1, 2, 0))
             denoiser.execute()
             self._check_device()
-            results.append(self._buffers["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
+            results.append(self._images["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
         return torch.stack(results)
 
     def _resize(self, height: int, width: int) -> None:
-        if self._buffers and self._buffers["output"].shape == (height, width, 3):
+        if self._images and self._images["output"].shape == (height, width, 3):
             return
         _release_filters(self._filters)
-        self._buffers = {
+        self._images = {
             name: torch.zeros(height, width, 3, dtype=torch.float32, device="cpu")
             for name in ("color", "albedo", "normal", "output")
         }
@@ -157,7 +157,7 @@ class Oidn(nn.Module):
         if key not in self._filters:
             made = self._oidn.Filter(self._device, self._oidn.OIDN_FILTER_TYPE_RT)
             for name in (*names, "output"):
-                made.set_image(name, self._buffers[name], self._oidn.OIDN_FORMAT_FLOAT3)
+                made.set_image(name, self._images[name], self._oidn.OIDN_FORMAT_FLOAT3)
             made.set_bool("hdr", "color" in names)
             made.set_bool("cleanAux", clean)
             made.set_quality(getattr(self._oidn, f"OIDN_QUALITY_{quality.upper()}"))

@@ -49,15 +49,11 @@ class OidnOpen(nn.Module):
     def needs(self) -> Needs:
         """Needs color and its features. It comes with weights, which can be trained further."""
         buffers = frozenset({"color", *self.features})
-        return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple)
+        return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple, live=self.unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
         return {"oidn_exposure": oidn_exposure(frame.color)}
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -82,7 +82,7 @@ class TunedNetwork(nn.Module):
     def needs(self) -> Needs:
         """Needs color; uses albedo, normal, and the previous result."""
         uses = frozenset({"albedo", "normal", PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
-        return Needs(uses=uses, reach=self.unet.reach, stride=self.unet.multiple)
+        return Needs(uses=uses, reach=self.unet.reach, stride=self.unet.multiple, live=self.unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image, and the fraction of the initial weights for its noise."""
@@ -100,10 +100,6 @@ class TunedNetwork(nn.Module):
         if not self.kept:
             self.start.load_state_dict(self.unet.state_dict())
             self.kept.fill_(1)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

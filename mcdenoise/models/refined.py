@@ -65,16 +65,15 @@ class FeatureNetwork(nn.Module):
         scales = range(self.unet.scales)
         reach = max(self.unet.reach(scale) + (2 << scale) for scale in scales) + sum(2 << scale for scale in scales)
         return Needs(
-            uses=frozenset({"albedo", "normal", "depth", "current", "length"}), reach=reach, stride=self.unet.multiple
+            uses=frozenset({"albedo", "normal", "depth", "current", "length"}),
+            reach=reach,
+            stride=self.unet.multiple,
+            live=self.unet.live,
         )
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure and depth scale of the whole image."""
         return image_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of a tile, see :class:`mcdenoise.models.Tiled`."""
-        return self.unet.bytes_per_pixel(bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """The filtered albedo; as stages the filtered normal and divisor of the demodulation, and the fraction m."""

@@ -48,7 +48,7 @@ from mcdenoise.nn.samples import (
     samples_of,
     with_context,
 )
-from mcdenoise.nn.unet import bytes_of
+from mcdenoise.nn.unet import Live
 from mcdenoise.ops import softmax_splat
 
 PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
@@ -80,15 +80,11 @@ class SbmcNetwork(nn.Module):
     def needs(self) -> Needs:
         """Uses features, samples, and the history length, which marks the accumulated sample."""
         uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
-        return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple)
+        return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple, live=Live(self._live))
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The depth scale of the whole image."""
         return image_statistics(frame)
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes, see :class:`mcdenoise.models.Tiled`: embeddings, logits, weights and buffers."""
-        return bytes_of(self._live, bfloat16=bfloat16)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -24,8 +24,6 @@ _WORTHWHILE = 0.9
 # border the corners of a constant image are off by 60 % (oidn_tuned), and pixels at the edge have 1.3 times the error.
 # Twice the width gains nothing more.
 MIRRORED = 16
-# Default for methods without this figure: some 64 feature channels in float32.
-_BYTES_PER_PIXEL = 4 * 64 + 4 * 54
 # Prefixes of results other than the image and its stages, whose names have no colon.
 _LAYER, _ALPHA = "layer:", "alpha:"
 
@@ -59,15 +57,6 @@ class Tiled(Wrapper):
         if needs.reach is None or TILE % needs.stride:
             return None
         return -(-(needs.reach + self.margin) // needs.stride) * needs.stride
-
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Memory that a tile takes while it is computed, for each pixel of the tile and its margin.
-
-        Args:
-            bfloat16: whether convolutions are in bfloat16, else in float32.
-        """
-        own = getattr(self.inner, "bytes_per_pixel", None)
-        return float(_BYTES_PER_PIXEL if own is None else own(bfloat16=bfloat16))
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, convolved_in_float32, max_pool
+from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._steps.network import network_input
 from mcdenoise.ops._window import computing_dtype, corner, up_to_multiple
@@ -93,14 +94,10 @@ class OidnUNet(nn.Module):
         convolutions: int = sum(count << level for count, level in zip(counts, levels, strict=True))
         return convolutions + 1 + _MULTIPLE - 1
 
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of the image, including input and result.
-
-        Args:
-            bfloat16: whether convolutions run in bfloat16, else in float32.
-        """
-        entering = _SIZES[self.size].decoder[-2][-1]
-        return 2 * entering * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
+    @property
+    def live(self) -> Live:
+        """What it holds at its peak."""
+        return Live(2 * _SIZES[self.size].decoder[-2][-1], _LIVE_IMAGES)
 
     def forward(self, x: Tensor) -> Tensor:
         """Predict.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,22 @@ from mcdenoise.ops._window import corner
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
 _LIVE_WIDTHS, _LIVE_IMAGES = 4.5, 54
+
+
+class Live(NamedTuple):
+    """Numbers per pixel of an image that a method holds at its peak, including its input and result.
+
+    Args:
+        features: in the precision of the convolutions.
+        images: in float32.
+    """
+
+    features: float
+    images: float = _LIVE_IMAGES
+
+    def bytes(self, *, bfloat16: bool) -> float:
+        """The memory per pixel; ``bfloat16``: whether convolutions run in it, else in float32."""
+        return self.features * (2 if bfloat16 else 4) + self.images * 4
 
 
 class UNet(nn.Module):
@@ -69,13 +86,10 @@ class UNet(nn.Module):
         convolutions: int = sum(2 * self.stride << level for level in (*down, *up))
         return convolutions + self.multiple - 1
 
-    def bytes_per_pixel(self, *, bfloat16: bool) -> float:
-        """Peak memory per pixel of the image, including input and result.
-
-        Args:
-            bfloat16: whether convolutions run in bfloat16, else in float32.
-        """
-        return bytes_of(_LIVE_WIDTHS * self.widths[0], bfloat16=bfloat16)
+    @property
+    def live(self) -> Live:
+        """What it holds at its peak."""
+        return Live(_LIVE_WIDTHS * self.widths[0])
 
     def forward(self, x: Tensor, coarse: Sequence[Tensor] = ()) -> list[Tensor]:
         """Compute features at each of the scales.
@@ -148,16 +162,6 @@ class Head(nn.Conv2d):
         """
         predicted = super().forward(features)
         return predicted if self.side == 1 else corner(F.pixel_shuffle(predicted, self.side), *size)
-
-
-def bytes_of(live: float, *, bfloat16: bool) -> float:
-    """Memory per pixel of an image for a network and the surrounding images and features, which are in float32.
-
-    Args:
-        live: numbers per pixel that the network holds at its peak.
-        bfloat16: whether these are in bfloat16, else in float32.
-    """
-    return live * (2 if bfloat16 else 4) + _LIVE_IMAGES * 4
 
 
 def _padded(x: Tensor, size: Sequence[int]) -> Tensor:

@@ -311,7 +311,7 @@ def test_the_largest_tiles_that_fit(loaded: float) -> None:
 def test_without_a_limit_only_large_frames_are_tiled() -> None:
     tiles = list(parts_of(create_model("cascaded_v2"), Tiled))
     assert [each.halo for each in tiles] == [64, 64]
-    needs = Network(64, max(each.bytes_per_pixel(bfloat16=False) for each in tiles))
+    needs = Network(64, max(each.inner.needs.live.bytes(bfloat16=False) for each in tiles))
 
     def chosen(width: int, height: int) -> Tiling:
         return Memory(None, CPU).choose(Frames((height, width), BUFFERS, streaming=True), needs)
