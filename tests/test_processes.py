@@ -24,7 +24,6 @@ from mcdenoise.ops._backend import choose_backend
 
 # Of each kind: kernels of a cascade, an a-trous filter, Open Image Denoise's network, and a local filter.
 METHODS = ["svgf", "cascaded_v2_micro", "oidn_tuned", "bmfr"]
-CPU = torch.device("cpu")
 
 
 def shot(seed: int, height: int = 80, width: int = 112, frames: int = 3) -> list[Frame]:
