@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from toys import refused, small, whole_frame
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Chain, Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models import Chain, create_model, parts_of
 from mcdenoise.models.cascaded import KernelNetwork, PixelNetwork
 from mcdenoise.nn import auto_exposure
 
@@ -259,20 +259,6 @@ def test_kernels_keep_a_constant_image() -> None:
         torch.testing.assert_close(network(frame)[0].image, frame.color, rtol=0, atol=1e-12)
     network = drawn(KernelNetwork(8, normalize="none"))
     assert not torch.allclose(network(frame)[0].image, frame.color, rtol=0.1)
-
-
-def test_its_wrappers_and_their_settings() -> None:
-    """The published accumulation with alpha 0.2, on demodulated radiance, without what came later."""
-    model = create_model("cascaded")
-    kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Chain)]
-    assert kinds == [Demodulated, Accumulated, Exposed, Chain]
-    accumulated = next(parts_of(model, Accumulated))
-    assert (accumulated.alpha_min, accumulated.rule) == (0.2, "bmfr")
-    assert (accumulated.position_limit, accumulated.normal_limit) == (0.01, 1.0)
-    assert accumulated.firefly_limit == accumulated.specular_length == accumulated.lag_threshold == math.inf
-    assert len(list(parts_of(model, Tiled))) == 2
-    changed = next(parts_of(create_model("cascaded", alpha_min=0.5, position_limit=2.0), Accumulated))
-    assert (changed.alpha_min, changed.position_limit) == (0.5, 2.0)
 
 
 @torch.no_grad()

@@ -35,12 +35,6 @@ def test_light_that_is_linear_in_the_guides_stays() -> None:
     torch.testing.assert_close(image, light, rtol=1e-5, atol=1e-6)
 
 
-def test_a_constant_image_stays() -> None:
-    given = frame()
-    constant = given.replace(color=torch.full_like(given.color, 0.7))
-    torch.testing.assert_close(Guided()(constant)[0].image, constant.color, rtol=1e-4, atol=0)
-
-
 def test_an_edge_of_normals_is_not_crossed() -> None:
     """Within a wall the guides are constant, so that each side is blurred, and by no more than eps with the other."""
     right = (torch.arange(44) >= 22).expand(1, 1, 40, 44)
@@ -50,13 +44,6 @@ def test_an_edge_of_normals_is_not_crossed() -> None:
     # In a window with the fraction f beyond the edge, the guides' variance along the step is f (1 - f) times two, of
     # which eps takes eps / (2 f (1 - f)), with f (1 - f) of 8 / 81 at least.
     assert (image - given.color).abs().max() < 0.9 * 1e-4 / (2 * 8 / 81) * 1.01
-
-
-def test_tiles_change_nothing() -> None:
-    given = frame(100, 140)
-    whole = Denoiser("guided")(given)
-    # Means over the windows are sums of fewer terms in a tile: seven guides, of a variance of eps at least, in float32.
-    torch.testing.assert_close(Denoiser("guided", tile=64)(given), whole, rtol=1e-3, atol=1e-4)
 
 
 def test_never_negative_and_finite_with_fireflies_and_background() -> None:
@@ -77,11 +64,3 @@ def test_has_no_weights_and_refuses_invalid_settings() -> None:
         create_model("guided", radius=0)
     with pytest.raises(InputError, match="eps:"):
         create_model("guided", eps=torch.nan)
-
-
-def test_history_survives_a_resize() -> None:
-    denoiser = Denoiser("guided")
-    for seed, size in enumerate(((40, 44), (40, 44), (5, 4))):
-        given = frame(*size, seed)
-        assert denoiser(given.replace(motion=torch.zeros(1, 2, *size))).shape == given.color.shape
-    assert denoiser.report.reset == "size change"

@@ -45,14 +45,6 @@ def test_is_the_filter_of_kornia() -> None:
     torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_tiles_change_nothing() -> None:
-    given = frame(100, 140)
-    whole = Denoiser("joint_bilateral", sigma_space=1.5)(given)
-    tiled = Denoiser("joint_bilateral", sigma_space=1.5, tile=64)
-    torch.testing.assert_close(tiled(given), whole, rtol=1e-5, atol=1e-6)
-    assert tiled.report.tiles.startswith("3 x 2 tiles")
-
-
 def test_windows_stay_within_memory() -> None:
     """Unfolded, a tile of the default has no more than 250 million values, also where kornia is called directly."""
     for sigma in (1.5, 4.0, 6.0, 12.0):
@@ -102,12 +94,3 @@ def test_has_no_weights_and_refuses_invalid_settings() -> None:
         create_model("joint_bilateral", sigma_space=torch.inf)
     with pytest.raises(InputError, match="it takes sigma_color, sigma_space, alpha_min"):
         create_model("joint_bilateral", sigma=1)
-
-
-def test_history_survives_a_resize() -> None:
-    denoiser = Denoiser("joint_bilateral", sigma_space=1.5)
-    for seed, size in enumerate(((20, 26), (20, 26), (11, 9))):
-        given = frame(*size, seed)
-        result = denoiser(given.replace(motion=torch.zeros(1, 2, *size)))
-        assert result.shape == given.color.shape
-    assert denoiser.report.reset == "size change"

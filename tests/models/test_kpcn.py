@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from toys import frame_of, refused
 
 from mcdenoise.frame import Frame, Hints
-from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, overview, parts_of
+from mcdenoise.models import create_model, parts_of
 from mcdenoise.models.kpcn import CHANNELS, PUBLISHED, KpcnNetwork, kpcn
 from mcdenoise.ops import luminance_moments, moments_variance
 
@@ -166,14 +166,6 @@ def test_both_parts_have_a_history() -> None:
 
 
 @torch.no_grad()
-def test_tiles_change_nothing() -> None:
-    network, frame = drawn(), parts(20, 150)
-    frame = frame.replace(statistics=network.statistics(frame))
-    whole, tiled = network(frame)[0].image, Tiled(network, side=32)(frame)[0].image
-    torch.testing.assert_close(tiled, whole, rtol=1e-12, atol=1e-12)
-
-
-@torch.no_grad()
 def test_layers_are_filtered_with_the_kernels_of_their_light() -> None:
     network, frame = drawn(), parts(6, 7)
     assert frame.diffuse is not None
@@ -202,19 +194,6 @@ def test_the_published_size() -> None:
             (441, 100),
         ]
     assert network.needs.reach == 18 + 4 + 10
-
-
-def test_the_default_is_small() -> None:
-    (entry,) = overview("kpcn")
-    # Five 5x5 convolutions of 27, 24, 24, 24, 24 and 121 channels; of a frame of color, one branch runs.
-    weights = 25 * (27 * 24 + 3 * 24 * 24 + 24 * 121)
-    assert entry.kmacs_per_pixel == pytest.approx(weights / 1e3)
-    assert entry.parameters == 2 * (weights + 4 * 24 + 121)
-
-
-def test_its_wrappers_and_their_settings() -> None:
-    model = create_model("kpcn")
-    assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]
 
 
 @pytest.mark.parametrize(("setting", "value"), [("width", 0), ("layers", 1), ("kernel_size", 4), ("kernel_size", 0)])

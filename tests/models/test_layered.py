@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from toys import refused, sampled
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model, overview
+from mcdenoise.models import create_model
 from mcdenoise.models.layered import LayeredNetwork
 from mcdenoise.nn.samples import samples_input
 
@@ -121,23 +121,6 @@ def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     assert image.max() <= given.samples.max() + 1e3 * 0.001 / (11 * 0.999)
     # The plain mean of the window has more than 1e3 / 27.
     assert samples.mean(1)[..., 1:4, 2:5].mean() > 1e3 / 27
-
-
-def test_the_default_is_small() -> None:
-    """The cost follows from the sizes of the layers: chains, two U-Nets, and the cost of a pixel without samples."""
-    (entry,) = overview("layered")
-    flat = [(11, 16), (16, 16), (16, 16), (32, 16), (16, 2), (16, 2 * 121 + 1)]
-    unets = [
-        (entering, leaving, level)
-        for first in (16, 48)
-        for entering, leaving, level in (
-            *((first, 16, 0), (16, 16, 0), (16, 32, 1), (32, 32, 1), (32, 64, 2), (64, 64, 2)),
-            *((96, 32, 1), (32, 32, 1), (48, 16, 0), (16, 16, 0)),
-        )
-    ]
-    assert entry.parameters == sum(a * b + b for a, b in flat) + sum(9 * a * b + b for a, b, _ in unets)
-    macs = sum(a * b for a, b in flat) + sum(9 * a * b / 4**level for a, b, level in unets)
-    assert entry.kmacs_per_pixel == pytest.approx(macs / 1e3)
 
 
 @pytest.mark.parametrize(("setting", "value"), [("width", 0), ("convolutions", 0), ("kernel_size", 4)])

@@ -10,10 +10,9 @@ import torch
 import torch.nn.functional as F
 from test_cascaded import frame_of_doubles, halved
 from torch import Tensor, nn
-from toys import whole_frame
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models import Tiled, create_model, parts_of
 from mcdenoise.models.kp import KpNetwork
 from mcdenoise.models.mrkp import MrkpNetwork, aligned
 
@@ -145,25 +144,3 @@ def test_tiles_give_the_image(name: str) -> None:
     frame = frame.replace(statistics=inner.statistics(frame))
     whole, tiled = inner(frame)[0].image, Tiled(inner, side=32)(frame)[0].image
     torch.testing.assert_close(tiled, whole)
-
-
-@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp"])
-def test_its_wrappers_and_their_settings(name: str) -> None:
-    """The published accumulation with alpha 0.2, on demodulated radiance."""
-    model = create_model(name)
-    kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Tiled)]
-    assert kinds == [Demodulated, Accumulated, Exposed, Tiled]
-    accumulated = next(parts_of(model, Accumulated))
-    assert (accumulated.alpha_min, accumulated.rule) == (0.2, "bmfr")
-    assert (accumulated.position_limit, accumulated.normal_limit) == (0.01, 1.0)
-
-
-@pytest.mark.parametrize("name", ["mrkp", "kp", "wskp"])
-@torch.no_grad()
-def test_a_constant_image_is_kept(name: str) -> None:
-    """Weights have the sum 1, but for 1e-8, and scales agree."""
-    torch.manual_seed(1)
-    model = create_model(name)
-    frame = whole_frame(model, 20, 23)
-    frame = frame.replace(color=torch.full_like(frame.color, 0.7), albedo=torch.ones_like(frame.color))
-    torch.testing.assert_close(model(frame)[0].image, frame.color, rtol=1e-4, atol=0)

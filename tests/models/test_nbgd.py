@@ -14,7 +14,7 @@ from toys import refused, small, whole_frame
 
 from mcdenoise.check import reference
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models import Tiled, create_model, parts_of
 from mcdenoise.models.nbgd import NeuralBilateralGrid
 from mcdenoise.nn import auto_exposure
 
@@ -82,15 +82,6 @@ def test_the_number_of_parameters_is_that_of_the_public_code(layers: int, parame
 
 def test_less_than_two_layers_are_refused() -> None:
     assert refused(lambda: create_model("nbgd", layers=1)) == "layers: expected at least 2, found 1"
-
-
-def test_its_wrappers_and_their_settings() -> None:
-    model = create_model("nbgd")
-    kinds = [type(part) for part in model.modules() if isinstance(part, Demodulated | Accumulated | Exposed | Tiled)]
-    assert kinds == [Demodulated, Accumulated, Exposed, Tiled]
-    accumulated = next(parts_of(model, Accumulated))
-    assert (accumulated.alpha_min, accumulated.rule) == (0.2, "bmfr")
-    assert network_of(model).needs.reach == 7 * 2 + 32
 
 
 @torch.no_grad()

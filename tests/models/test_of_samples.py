@@ -10,7 +10,7 @@ from torch import nn
 from toys import sampled
 
 from mcdenoise.frame import Hints
-from mcdenoise.models import Demodulated, Exposed, Tiled, create_model, parts_of
+from mcdenoise.models import create_model
 from mcdenoise.models.layered import LayeredNetwork
 from mcdenoise.models.sbmc import SbmcNetwork
 
@@ -44,15 +44,6 @@ def test_light_without_noise_comes_back(name: str) -> None:
 
 @both
 @torch.no_grad()
-def test_tiles_change_nothing(name: str) -> None:
-    network, given = drawn(name), sampled(20, 300)
-    given = given.replace(statistics=network.statistics(given))
-    whole, tiled = network(given)[0].image, Tiled(network, side=32)(given)[0].image
-    torch.testing.assert_close(tiled, whole, rtol=1e-12, atol=1e-12)
-
-
-@both
-@torch.no_grad()
 def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
     network, given = drawn(name), sampled(5, 6, samples=1)
     layers = {"half": given.color / 2, "rest": given.color / 2}
@@ -61,9 +52,3 @@ def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
     for layer in output.layers.values():
         torch.testing.assert_close(layer, output.image / 2)
     torch.testing.assert_close(output.alpha, alpha)
-
-
-@both
-def test_its_wrappers_and_their_settings(name: str) -> None:
-    model = create_model(name)
-    assert [len(list(parts_of(model, kind))) for kind in (Demodulated, Exposed, Tiled)] == [1, 1, 1]

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from toys import refused, sampled
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model, overview
+from mcdenoise.models import create_model
 from mcdenoise.models.sbmc import PUBLISHED, SbmcNetwork, sbmc
 from mcdenoise.nn.samples import samples_input
 
@@ -122,13 +122,6 @@ def test_the_published_size() -> None:
     assert sum(parameter.numel() for parameter in network.parameters()) == weights(128, 3, 3, 21)[0]
     assert network.kernel[-1].weight.shape[0] == 441
     assert network.needs.reach == 3 * (3 * 10 + 6 + 3) + 10
-
-
-def test_the_default_is_small() -> None:
-    (entry,) = overview("sbmc")
-    parameters, macs = weights(16, 3, 2, 11)
-    assert entry.parameters == parameters
-    assert entry.kmacs_per_pixel == pytest.approx(macs / 1e3)
 
 
 @pytest.mark.parametrize(("setting", "value"), [("width", 0), ("rounds", 0), ("convolutions", 0), ("kernel_size", 4)])

@@ -10,7 +10,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
-from mcdenoise.models.svgf import History, Svgf
+from mcdenoise.models.svgf import Svgf
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
 
 HEIGHT, WIDTH = 24, 40
@@ -30,13 +30,6 @@ def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Fram
         "motion": torch.zeros_like(light[:, :2]),
     }
     return Frame(**{**buffers, **changes})
-
-
-def test_a_constant_image_stays() -> None:
-    denoiser = Denoiser("svgf")
-    given = frame(torch.full((1, 3, HEIGHT, WIDTH), 0.7), albedo=torch.full((1, 3, HEIGHT, WIDTH), 0.5))
-    for _ in range(6):
-        torch.testing.assert_close(denoiser(given), given.color, rtol=1e-5, atol=0)
 
 
 def test_noise_falls_in_space_and_in_time() -> None:
@@ -179,19 +172,6 @@ def test_differentiable_through_time() -> None:
         return model(frames[1], state)[0].image
 
     assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
-
-
-def test_is_pure_and_batches() -> None:
-    both = frame(torch.rand(2, 3, HEIGHT, WIDTH), normal=frame().normal.repeat(2, 1, 1, 1))
-    model = Svgf()
-    _, state = model(both)
-    output, after = model(both, state)
-    again, _ = model(both, state)
-    assert torch.equal(output.image, again.image)
-    assert isinstance(after, History)
-    second = both.map(lambda image: image[1:])
-    alone, _ = model(second, model(second)[1])
-    torch.testing.assert_close(output.image[1:], alone.image)
 
 
 def test_has_no_weights_and_declares_its_needs() -> None:
