@@ -14,8 +14,10 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model
 from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.chain import Chain
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
+from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import remodulate
 
@@ -58,23 +60,39 @@ def as_published(
 
 
 def published(network: Callable[..., Model]) -> Callable[..., Model]:
-    """Put the network that a function makes behind exposure and :func:`as_published`, with its settings by keyword.
+    """A constructor of a network, or of a chain of tiled ones, behind exposure and :func:`as_published`.
 
-    A model's settings are then those of the function, which determine its weights, and ``alpha_min``,
+    A model's settings are then those of the network, which determine its weights, and by keyword ``alpha_min``,
     ``position_limit`` and ``normal_limit``.
     """
 
-    @functools.wraps(network)
+    @functools.wraps(network, updated=())
     def made(*sizes: Any, **named: Any) -> Model:
         history = {name: named.pop(name) for name in accumulation if name in named}
-        return as_published(Exposed(network(*sizes, **named)), **history)
+        inner = network(*sizes, **named)
+        return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), **history)
 
     _, *settings = inspect.signature(as_published).parameters.values()
     accumulation = {each.name: each.replace(kind=each.KEYWORD_ONLY) for each in settings}
-    own = inspect.signature(network)
-    signature = own.replace(parameters=[*own.parameters.values(), *accumulation.values()])
-    made.__signature__ = signature  # type: ignore[attr-defined]
+    made.__signature__ = _with(network, *accumulation.values())  # type: ignore[attr-defined]
     return made
+
+
+def demodulated(method: Callable[..., Model]) -> Callable[..., Model]:
+    """A constructor of a method on demodulated light, with the method's settings."""
+
+    @functools.wraps(method, updated=())
+    def made(**settings: Any) -> Model:
+        return Demodulated(method(**settings))
+
+    made.__signature__ = _with(method)  # type: ignore[attr-defined]
+    return made
+
+
+def _with(constructor: Callable[..., Model], *settings: inspect.Parameter) -> inspect.Signature:
+    """The signature of a constructor with further settings."""
+    own = inspect.signature(constructor)
+    return own.replace(parameters=[*own.parameters.values(), *settings])
 
 
 def check_odd(kernel_size: int) -> None:

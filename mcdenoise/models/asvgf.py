@@ -42,10 +42,10 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs
+from mcdenoise.models._interface import Needs
+from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import surface_before
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, History, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
 
@@ -130,36 +130,9 @@ class Asvgf(Svgf):
         return torch.lerp(both, entering, change), 1 / (change + (1 - change) / length)
 
 
-@register_model("asvgf", kind="filter", paper="Schied et al. 2018")
-def asvgf(
-    *,
-    alpha: float = 0.1,
-    gradient_levels: int = 5,
-    threshold: float = 2.0,
-    levels: int = 5,
-    sigma_z: float = 1.0,
-    sigma_n: float = 128.0,
-    sigma_l: float = 4.0,
-) -> Model:
-    """SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.
-
-    Args:
-        alpha: see :class:`Asvgf`.
-        gradient_levels: likewise.
-        threshold: likewise.
-        levels: likewise.
-        sigma_z: see :func:`mcdenoise.ops.atrous`.
-        sigma_n: likewise.
-        sigma_l: likewise.
-    """
-    return Demodulated(
-        Asvgf(
-            alpha=alpha,
-            gradient_levels=gradient_levels,
-            threshold=threshold,
-            levels=levels,
-            sigma_z=sigma_z,
-            sigma_n=sigma_n,
-            sigma_l=sigma_l,
-        )
-    )
+asvgf = register_model(
+    "asvgf",
+    "SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.",
+    kind="filter",
+    paper="Schied et al. 2018",
+)(demodulated(Asvgf))

@@ -12,12 +12,11 @@ from __future__ import annotations
 from torch import nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import TenChannels, check_odd, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.mrkp import Backbone, with_glorot
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import cross_bilateral_filter
 
 
@@ -32,7 +31,7 @@ class KpNetwork(TenChannels):
         InputError: a setting is out of its range.
     """
 
-    def __init__(self, width: int, kernel_size: int) -> None:
+    def __init__(self, width: int = 48, kernel_size: int = 13) -> None:
         super().__init__()
         check_odd(kernel_size)
         self.unet, self._radius = Backbone(10, width), kernel_size // 2
@@ -52,18 +51,9 @@ class KpNetwork(TenChannels):
         return answered(frame, filtered), None
 
 
-@register_model(
+kp = register_model(
     "kp",
     "one larger kernel at full resolution, as the paper compares with",
     kind="kernel",
     paper="after Bako et al. 2017",
-)
-@published
-def kp(width: int = 48, kernel_size: int = 13) -> Model:
-    """Kernel prediction with one kernel at full resolution, behind the published accumulation.
-
-    Args:
-        width: channels of every convolution.
-        kernel_size: k of the kernels, odd.
-    """
-    return Tiled(KpNetwork(width, kernel_size))
+)(published(KpNetwork))

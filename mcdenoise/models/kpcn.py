@@ -42,12 +42,11 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import check_odd, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.svgf import BRIGHTEST
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
@@ -88,7 +87,7 @@ class KpcnNetwork(nn.Module):
         InputError: a setting is out of its range.
     """
 
-    def __init__(self, width: int, layers: int, kernel_size: int, split: bool = True) -> None:
+    def __init__(self, width: int = 24, layers: int = 5, kernel_size: int = 11, split: bool = True) -> None:
         super().__init__()
         if width < 1:
             raise InputError(f"width: expected at least 1, found {width}")
@@ -150,20 +149,9 @@ def _seen(image: Tensor, frame: Frame) -> Tensor:
     return torch.cat([image, features, *differences, torch.log1p(variance).to(image.dtype)], 1)
 
 
-@register_model(
+kpcn = register_model(
     "kpcn",
     "diffuse and specular light by networks of their own, small, with a history",
     kind="kernel",
     paper="Bako et al. 2017",
-)
-@published
-def kpcn(width: int = 24, layers: int = 5, kernel_size: int = 11, split: bool = True) -> Model:
-    """KPCN of Bako et al. 2017; ``kpcn(**PUBLISHED)`` has the paper's sizes.
-
-    Args:
-        width: see :class:`KpcnNetwork`.
-        layers: likewise.
-        kernel_size: likewise.
-        split: likewise.
-    """
-    return Tiled(KpcnNetwork(width, layers, kernel_size, split))
+)(published(KpcnNetwork))

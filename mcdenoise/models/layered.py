@@ -34,11 +34,10 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
     CHANNELS,
@@ -71,7 +70,7 @@ class LayeredNetwork(nn.Module):
         InputError: a setting is out of its range.
     """
 
-    def __init__(self, width: int, convolutions: int, kernel_size: int) -> None:
+    def __init__(self, width: int = 16, convolutions: int = 2, kernel_size: int = 11) -> None:
         super().__init__()
         check_odd(kernel_size)
         self.taps = kernel_size**2
@@ -121,19 +120,9 @@ class LayeredNetwork(nn.Module):
         return answered(frame, image).noted(Note("samples", describe_samples(frame))), None
 
 
-@register_model(
+layered = register_model(
     "layered",
     "filters samples in two layers, re-implemented, small, with a history",
     kind="kernel",
     paper="Munkberg and Hasselgren 2020",
-)
-@published
-def layered(width: int = 16, convolutions: int = 2, kernel_size: int = 11) -> Model:
-    """Layer embeddings (Munkberg and Hasselgren 2020).
-
-    Args:
-        width: see :class:`LayeredNetwork`.
-        convolutions: likewise.
-        kernel_size: likewise.
-    """
-    return Tiled(LayeredNetwork(width, convolutions, kernel_size))
+)(published(LayeredNetwork))

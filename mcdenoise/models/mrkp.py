@@ -24,11 +24,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import TenChannels, check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
@@ -179,15 +178,6 @@ def aligned(image: Tensor, height: int, width: int) -> Tensor:
     return corner(F.interpolate(padded, size, mode="bilinear", align_corners=True), height, width)
 
 
-@register_model(
+mrkp = register_model(
     "mrkp", "5x5 kernels at three scales, as in Meng's code of 2020", kind="kernel", paper="Vogels et al. 2018"
-)
-@published
-def mrkp(width: int = 48, kernel_size: int = 5) -> Model:
-    """Kernel prediction at several scales, behind the published accumulation.
-
-    Args:
-        width: channels of every convolution.
-        kernel_size: k of the kernels, odd.
-    """
-    return Tiled(MrkpNetwork(width, kernel_size))
+)(published(MrkpNetwork))

@@ -39,11 +39,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import TenChannels, displayed, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops import grid_slice, grid_splat
 
@@ -129,14 +128,6 @@ def _sum(weights: Sequence[Tensor], images: Sequence[Tensor]) -> Tensor:
     return first + second + third
 
 
-@register_model(
+nbgd = register_model(
     "nbgd", "three bilateral grids on guides that a network of 7 layers draws", kind="grid", paper="Meng et al. 2020"
-)
-@published
-def nbgd(layers: int = 7) -> Model:
-    """The neural bilateral grid on accumulated and demodulated radiance.
-
-    Args:
-        layers: see :class:`NeuralBilateralGrid`.
-    """
-    return Tiled(NeuralBilateralGrid(layers))
+)(published(NeuralBilateralGrid))

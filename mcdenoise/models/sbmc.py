@@ -31,11 +31,10 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
     CHANNELS,
@@ -67,7 +66,7 @@ class SbmcNetwork(nn.Module):
         InputError: a setting is out of its range.
     """
 
-    def __init__(self, width: int, rounds: int, convolutions: int, kernel_size: int) -> None:
+    def __init__(self, width: int = 16, rounds: int = 3, convolutions: int = 2, kernel_size: int = 11) -> None:
         super().__init__()
         check_odd(kernel_size)
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
@@ -104,20 +103,9 @@ class SbmcNetwork(nn.Module):
         return answered(frame, mean).noted(Note("samples", describe_samples(frame))), None
 
 
-@register_model(
+sbmc = register_model(
     "sbmc",
     "splats every sample with a kernel of its own, small, with a history",
     kind="kernel",
     paper="Gharbi et al. 2019",
-)
-@published
-def sbmc(width: int = 16, rounds: int = 3, convolutions: int = 2, kernel_size: int = 11) -> Model:
-    """SBMC of Gharbi et al. 2019; ``sbmc(**PUBLISHED)`` has the sizes of their code.
-
-    Args:
-        width: see :class:`SbmcNetwork`.
-        rounds: likewise.
-        convolutions: likewise.
-        kernel_size: likewise.
-    """
-    return Tiled(SbmcNetwork(width, rounds, convolutions, kernel_size))
+)(published(SbmcNetwork))

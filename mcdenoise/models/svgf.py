@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import motion_to_previous, surface_before
-from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
 
 # With fewer frames, moments over time hardly determine the variance.
@@ -167,17 +167,9 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
     return torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
 
 
-@register_model("svgf", kind="filter", paper="Schied et al. 2017")
-def svgf(
-    *, alpha: float = 0.2, levels: int = 5, sigma_z: float = 1.0, sigma_n: float = 128.0, sigma_l: float = 4.0
-) -> Model:
-    """Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.
-
-    Args:
-        alpha: see :class:`Svgf`.
-        levels: likewise.
-        sigma_z: see :func:`mcdenoise.ops.atrous`.
-        sigma_n: likewise.
-        sigma_l: likewise.
-    """
-    return Demodulated(Svgf(alpha=alpha, levels=levels, sigma_z=sigma_z, sigma_n=sigma_n, sigma_l=sigma_l))
+svgf = register_model(
+    "svgf",
+    "Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.",
+    kind="filter",
+    paper="Schied et al. 2017",
+)(demodulated(Svgf))

@@ -28,11 +28,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import TenChannels, displayed, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.tiled import Tiled
 from mcdenoise.ops import importance_filter
 
 SIDES = (3, 5, 7, 9, 11, 13)
@@ -121,18 +120,6 @@ def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[i
     return out
 
 
-@register_model(
+wskp = register_model(
     "wskp", "kernels of shared weights, 3x3 to 13x13, as in its public code", kind="kernel", paper="Fan et al. 2021"
-)
-@published
-def wskp(width: int = 14, layers: int = 6) -> Model:
-    """Kernel prediction with shared weights, behind the published accumulation.
-
-    Args:
-        width: channels between the convolutions.
-        layers: number of convolutions: 6, or 3 as in the smaller network of the public code.
-
-    Raises:
-        InputError: there are fewer than two layers.
-    """
-    return Tiled(WskpNetwork(width, layers))
+)(published(WskpNetwork))
