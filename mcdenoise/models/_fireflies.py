@@ -1,18 +1,22 @@
-"""Which bright pixels are fireflies: not those that were bright in the frame before, too."""
+"""Which bright pixels are fireflies, and how much light they have: not those that were bright in the frame before."""
 
 from __future__ import annotations
 
 import itertools
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.models._reads import at_hand
+from mcdenoise.ops._steps.history import incoming
 
 # A pixel may be this many times as bright as it was in the frame before. What is clamped there is believed a little
 # more in every frame, so that a star a thousand times as bright as its sky has its light from the fourth or fifth frame
 # on, while two fireflies in one place remain fireflies.
 GAIN = 6.0
+# Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
+_BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
 
 def steady(light: Tensor, clamped: Tensor, before: Tensor, motion: Tensor | None) -> Tensor | None:
@@ -63,3 +67,35 @@ def clamped_fraction(light: Tensor, clamped: Tensor) -> Tensor:
     """``(B,)`` fraction of the light of each image that clamping takes; both are ``(B, 3, H, W)``."""
     before, after = (image.detach().mean((1, 2, 3)) for image in (light, clamped))
     return torch.where(before > 0, (before - after) / torch.where(before > 0, before, 1), 0)
+
+
+def light_of_fireflies(color: Tensor) -> Tensor:
+    """Fraction of the light of the median 32x32 block that clamping takes.
+
+    Args:
+        color: ``(B, 3, H, W)`` radiance without albedo, finite and non-negative.
+
+    Returns:
+        ``(B,)``; 0 for images with fewer than 16 lit blocks.
+    """
+    color = color.detach()
+    height = color.shape[-2]
+    step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
+    # A graph for images of any size has no strips.
+    whole = step == _BLOCK or torch.compiler.is_compiling()
+    strips = [color] if whole else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
+    fractions = []
+    for strip in strips:
+        light = strip.to(torch.promote_types(color.dtype, torch.float32))
+        before, after = (
+            F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
+            for image in (light, incoming(light, compared=False))
+        )
+        # Not a number where there is no light to lose.
+        fractions.append((1 - after / before).flatten(1))
+    lost = torch.cat(fractions, 1)
+    # The lower median of all numbers, like nanmedian, which ONNX lacks.
+    known = (~lost.isnan()).sum(1, keepdim=True)
+    ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
+    median = ascending.gather(1, (known - 1).clamp_min(0) // 2)
+    return torch.where(known >= _LEAST_BLOCKS, median, 0)[:, 0]

@@ -7,18 +7,19 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
+from mcdenoise.models._fireflies import light_of_fireflies
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
+from mcdenoise.models._motion import comparable, is_still, motion_unless_still, surface_before
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface, motion_from_position
+from mcdenoise.ops import Surface
 from mcdenoise.ops._steps.history import (
     COLOR,
     MEAN,
@@ -41,8 +42,6 @@ SPECULAR_LENGTH = 2.0
 # Where clamping would take more than this fraction of the light of the median block, the shot's light is caustics,
 # which have another limit.
 _LOST, CAUSTICS = 0.1, 120.0
-# Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
-_BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 # A light is steady if its compressed radiance varied by less than this fraction over the history.
 _STEADY = 0.1
 _NO_WAY = "no motion, and no position with a previous camera"
@@ -116,7 +115,6 @@ class Accumulated(Wrapper):
         specular_length: the longest history of mirrors and glass while the image moves, in frames, at least 0; infinity
             treats them as everything else.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test for changes of light.
-        clamp_current: whether fireflies are also clamped in ``current``.
         also: names of further buffers to accumulate with the weights of the color, where a frame has them: buffers
             ``(B, 3, H, W)`` of ``frame.extra``, whose fireflies are kept; or ``"diffuse"`` and ``"specular"``, which
             the method sees accumulated.
@@ -136,7 +134,6 @@ class Accumulated(Wrapper):
         firefly_limit: float | None = None,
         specular_length: float = SPECULAR_LENGTH,
         lag_threshold: float = THRESHOLD,
-        clamp_current: bool = True,
         also: Sequence[str] = (),
     ) -> None:
         super().__init__(inner)
@@ -147,7 +144,7 @@ class Accumulated(Wrapper):
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
-        self.clamp_current, self.also = clamp_current, tuple(also)
+        self.also = tuple(also)
 
     stage = "accumulate"
 
@@ -240,7 +237,7 @@ class Accumulated(Wrapper):
         else:
             notes.append(Note("history", "cut", blind_cut, found, otherwise=""))
         after = None
-        current = entering[:, COLOR] if self.clamp_current else frame.color.to(color.dtype)
+        current = entering[:, COLOR]
         del entering
         if keeps:
             # In most frames no light is seen, and all labels are 0.
@@ -365,94 +362,6 @@ class Accumulated(Wrapper):
         ]
 
 
-def surface_before(frame: Frame) -> Surface:
-    """The surfaces of a frame at their positions in the frame before, with the current normals and depths."""
-    before = frame.position if frame.previous_position is None else frame.previous_position
-    return Surface(before, frame.normal, frame.depth)
-
-
-def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) -> Tensor | None:
-    """The motion of each pixel's surface point: its place in the frame before minus its place now.
-
-    Args:
-        frame: the current frame.
-        previous_view_projection: ``(B, 4, 4)`` of the frame before; needed where the frame has no motion of its own.
-
-    Returns:
-        ``(B, 2, H, W)`` pixels: the frame's own motion, else that of its previous positions (its positions, where it
-        has none) seen from the previous camera; ``None`` where it has neither.
-    """
-    if frame.motion is not None:
-        return frame.motion
-    position = surface_before(frame).position
-    if position is None or previous_view_projection is None:
-        return None
-    return motion_from_position(position, previous_view_projection)
-
-
-def has_motion(frame: Frame, previous_view_projection: Tensor | None) -> bool:
-    """Whether a frame tells where its pixels were in the frame before, without computing it."""
-    return tells_motion(frame.buffers) and (frame.motion is not None or previous_view_projection is not None)
-
-
-def motion_unless_still(
-    frame: Frame, previous_view_projection: Tensor | None, still: bool | Tensor | None = None
-) -> Tensor | None:
-    """Motion as :func:`motion_to_previous` has it where something moves; else ``None``.
-
-    Args:
-        frame: the current frame.
-        previous_view_projection: see :func:`motion_to_previous`.
-        still: result of :func:`is_still`, if that is known already.
-    """
-    still = is_still(frame, previous_view_projection) if still is None else still
-    if isinstance(still, Tensor):
-        motion = motion_to_previous(frame, previous_view_projection)
-        return None if motion is None else torch.where(still, 0, motion)
-    if still and not (frame.hints.keep_all and frame.motion is not None):
-        return None
-    return motion_to_previous(frame, previous_view_projection)
-
-
-def comparable(surface: Surface, previous: Surface) -> tuple[Surface, Surface]:
-    """Two surfaces for the relative test: without a depth, positions are not compared."""
-    if surface.depth is not None and previous.depth is not None:
-        return surface, previous
-    return surface._replace(position=None), previous._replace(position=None)
-
-
-def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Tensor:
-    """Whether nothing moved in the image since the frame before, as far as the frame tells.
-
-    Returns:
-        Whether its motion is zero everywhere, or else the camera is the same and no position differs from its previous
-        position; a tensor where values are not at hand.
-    """
-    blind = not at_hand(frame.color.device)
-    if frame.motion is not None:
-        if blind:
-            return ~frame.motion.any()
-        return not (_thinned(frame.motion).any() or frame.motion.any())
-    pairs = [(previous_view_projection, frame.view_projection)]
-    if frame.previous_position is not None:
-        pairs.append((frame.position, frame.previous_position))
-    known = [(a, b) for a, b in pairs if a is not None and b is not None]
-    if frame.position is None or len(known) < len(pairs):
-        return False
-    if blind:
-        return torch.stack([torch.eq(a, b).all() for a, b in known]).all()
-    return all(_equal(a, b) for a, b in known)
-
-
-def _equal(a: Tensor, b: Tensor) -> bool:
-    return a is b or (torch.equal(_thinned(a), _thinned(b)) and torch.equal(a, b))
-
-
-def _thinned(image: Tensor) -> Tensor:
-    """One pixel in 64: enough to detect most motion."""
-    return image[..., ::8, ::8]
-
-
 def _misfit(history: History, frame: Frame) -> str:
     """Why a history cannot be that of a frame; empty if it can."""
     if history.length.shape != frame.color[:, :1].shape:
@@ -464,35 +373,3 @@ def _steady(color: Tensor) -> Tensor:
     """The pixels in which the compressed radiance of a history has hardly varied."""
     mean = color[:, MEAN]
     return color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
-
-
-def light_of_fireflies(color: Tensor) -> Tensor:
-    """Fraction of the light of the median 32x32 block that clamping takes.
-
-    Args:
-        color: ``(B, 3, H, W)`` radiance without albedo, finite and non-negative.
-
-    Returns:
-        ``(B,)``; 0 for images with fewer than 16 lit blocks.
-    """
-    color = color.detach()
-    height = color.shape[-2]
-    step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
-    # A graph for images of any size has no strips.
-    whole = step == _BLOCK or torch.compiler.is_compiling()
-    strips = [color] if whole else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
-    fractions = []
-    for strip in strips:
-        light = strip.to(torch.promote_types(color.dtype, torch.float32))
-        before, after = (
-            F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
-            for image in (light, incoming(light, compared=False))
-        )
-        # Not a number where there is no light to lose.
-        fractions.append((1 - after / before).flatten(1))
-    lost = torch.cat(fractions, 1)
-    # The lower median of all numbers, like nanmedian, which ONNX lacks.
-    known = (~lost.isnan()).sum(1, keepdim=True)
-    ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
-    median = ascending.gather(1, (known - 1).clamp_min(0) // 2)
-    return torch.where(known >= _LEAST_BLOCKS, median, 0)[:, 0]

@@ -14,9 +14,9 @@ from torch import Tensor
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.ops import reproject
 
 _GAMMA = 2.2

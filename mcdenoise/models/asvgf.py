@@ -43,9 +43,9 @@ from torch import Tensor
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Needs
+from mcdenoise.models._motion import surface_before
 from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
-from mcdenoise.models.accumulated import surface_before
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, History, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
 

@@ -41,10 +41,10 @@ from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._motion import has_motion, motion_unless_still, surface_before
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
-from mcdenoise.models.accumulated import has_motion, motion_unless_still, surface_before
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import Surface, block_regression, reproject
 from mcdenoise.ops.regression import BLOCK, RIDGE

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._fireflies import GAIN, clamped_fraction, steady
+from mcdenoise.models._fireflies import GAIN, clamped_fraction, light_of_fireflies, steady
 from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._motion import motion_to_previous
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import CAUSTICS, light_of_fireflies, motion_to_previous
+from mcdenoise.models.accumulated import CAUSTICS
 from mcdenoise.noise import noise_of
 from mcdenoise.ops._steps.history import incoming
 

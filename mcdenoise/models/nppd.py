@@ -50,9 +50,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
-from mcdenoise.models.accumulated import has_motion, motion_unless_still
 from mcdenoise.models.tiled import MIRRORED, Region
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import describe_samples, samples_of

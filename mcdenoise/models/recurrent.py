@@ -9,9 +9,9 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.accumulated import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.ops import Surface, demodulate, remodulate, reproject, resample
 
 # Keys in ``frame.extra``: the reprojected previous image, and its weight, the fraction that shows the same surface.

@@ -20,10 +20,10 @@ from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._motion import motion_to_previous, surface_before
 from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
-from mcdenoise.models.accumulated import motion_to_previous, surface_before
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
 
 # With fewer frames, moments over time hardly determine the variance.

@@ -29,7 +29,7 @@ from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
-from mcdenoise.models.accumulated import motion_to_previous
+from mcdenoise.models._motion import motion_to_previous
 from mcdenoise.train.front import ACCUMULATED, Front
 from mcdenoise.train.shots import Array, Shot
 

@@ -16,7 +16,8 @@ from toys import Mean, Shot, Watching, refused, still, whole_frame
 from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models import Accumulated
-from mcdenoise.models.accumulated import History, is_still
+from mcdenoise.models._motion import is_still
+from mcdenoise.models.accumulated import History
 from mcdenoise.ops import accumulate, demodulate, remodulate
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops.temporal import Rule
