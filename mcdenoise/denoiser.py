@@ -10,7 +10,6 @@ import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType
 from typing import Any, Concatenate, Literal, ParamSpec, TypeVar, get_args
@@ -24,7 +23,6 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError, did_you_mean, level_of_caller
 from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
-from mcdenoise.light import Repairs
 from mcdenoise.models import (
     DEFAULT,
     EXACT,
@@ -32,7 +30,6 @@ from mcdenoise.models import (
     Model,
     Note,
     Output,
-    Report,
     State,
     computing_in,
     create_model,
@@ -46,6 +43,7 @@ from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
+from mcdenoise.models._report import FrameReport
 from mcdenoise.models._times import Times
 from mcdenoise.models._void import Void, with_void, without_void
 from mcdenoise.models._weights import model_of
@@ -95,55 +93,6 @@ def _after_fork() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_after_fork)
-
-
-@dataclass
-class FrameReport(Report):
-    """Report of one frame.
-
-    Args:
-        precision: the reason for the precision of the convolutions.
-        model: the model that the first frame has picked, and why; empty if it was named.
-        repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
-        repeats: the advice for frames that repeat the noise of the frame before; empty for others.
-        missing: buffers that would improve the result and that the frame lacks.
-        beside: milliseconds of work that overlaps with denoising another frame: read, write.
-    """
-
-    precision: str = ""
-    model: str = ""
-    repairs: Repairs = field(default_factory=Repairs)
-    repeats: str = ""
-    missing: list[str] = field(default_factory=list)
-    beside: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def replaced_pixels(self) -> int:
-        """Number of pixels of the noisy color that were NaN, infinite, negative or above 1e16."""
-        return self.repairs.pixels
-
-    def __str__(self) -> str:
-        """A few lines: run times, the history, and what was skipped, missing or replaced."""
-        stages = ", ".join(f"{stage} {value:.1f}" for stage, value in self.milliseconds.items())
-        history = "" if self.history is None else f"{self.history:.0%} of the pixels"
-        skipped = (
-            f"{stage.name}{'' if stage.skipped == 1 else f' {stage.skipped:.1%}'} ({stage.reason})"
-            for stage in self.stages.values()
-            if stage.skipped
-        )
-        lines = {
-            "milliseconds": f"{stages}; together {sum(self.milliseconds.values()):.1f}" if stages else "",
-            "history": f"none ({self.reset})" if self.reset else history,
-            "skipped": ", ".join(skipped),
-            "missing": ", ".join(self.missing),
-            "replaced pixels": str(self.replaced_pixels or ""),
-            "fireflies": f"{self.fireflies:.2%} of the light clamped" if self.fireflies > 0 else "",
-            "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
-            "tiles": self.tiles,
-            "precision": self.precision,
-            "model": self.model,
-        }
-        return "\n".join(f"{name}: {text}" for name, text in lines.items() if text)
 
 
 class Denoiser:

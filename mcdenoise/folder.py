@@ -22,10 +22,10 @@ from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.files import check_writable, remove, write_json
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
-from mcdenoise.denoiser import Denoiser, FrameReport
+from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import Output, Skipping, Stage, parts_of, summarize
+from mcdenoise.models import FrameReport, Output, Skipping, Stage, parts_of, summarize
 
 # Largest fraction of pixels without a history, and smallest correlation of two images of the same place.
 _MOST, _ALIKE = 0.5, 0.9

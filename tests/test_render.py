@@ -23,7 +23,7 @@ from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import Report, create_model
+from mcdenoise.models import FrameReport, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
@@ -699,7 +699,7 @@ def test_history_follows_what_moves(moving: Path) -> None:
             assert frame.previous_position is not None
             moved = (frame.previous_position != frame.position).any(1, keepdim=True)
             output, state = accumulated(frame if known else frame.replace(previous_position=None), state)
-        report = Report()
+        report = FrameReport()
         report.add(output.notes)
         assert report.reset == ""
         kept[known] = (state[0].length[moved] > 1).float().mean().item()

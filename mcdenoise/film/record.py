@@ -19,10 +19,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.denoiser import FrameReport
 from mcdenoise.errors import InputError
 from mcdenoise.light import Repairs
-from mcdenoise.models import Stage
+from mcdenoise.models import FrameReport, Stage
 
 # Path, size, time of the last change in nanoseconds; a time of -1 is that of no file.
 Stamp = tuple[str, int, int]

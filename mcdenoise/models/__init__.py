@@ -13,7 +13,7 @@ from mcdenoise.models._precision import (
 )
 from mcdenoise.models._registry import build_model, find_model, list_models, register_model, troubles
 from mcdenoise.models._remembered import frames_remembered
-from mcdenoise.models._report import Report, Stage, summarize
+from mcdenoise.models._report import FrameReport, Stage, summarize
 from mcdenoise.models._weights import (
     compared_models,
     create_model,
@@ -56,6 +56,7 @@ __all__ = [
     "CoarseToFine",
     "Demodulated",
     "Exposed",
+    "FrameReport",
     "FromBuffers",
     "Model",
     "ModelOverview",
@@ -65,7 +66,6 @@ __all__ = [
     "Precision",
     "Recurrent",
     "Region",
-    "Report",
     "Restored",
     "Skipping",
     "Stage",

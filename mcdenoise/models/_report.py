@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
+from mcdenoise.light import Repairs
 from mcdenoise.models._interface import Note
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._stopwatch import Moment, Stopwatch
@@ -40,7 +41,7 @@ class Stage:
 
 
 @dataclass
-class Report:
+class FrameReport:
     """The report of one frame. For a frame on a GPU it is complete after :meth:`settle`.
 
     Args:
@@ -50,6 +51,12 @@ class Report:
         tiles: how the image was divided into tiles, and why.
         history: fraction of the pixels that have a history; ``None`` if no history was looked up.
         fireflies: fraction of the light that was clamped in fireflies.
+        precision: the reason for the precision of the convolutions.
+        model: the model that the first frame has picked, and why; empty if it was named.
+        repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
+        repeats: the advice for frames that repeat the noise of the frame before; empty for others.
+        missing: buffers that would improve the result and that the frame lacks.
+        beside: milliseconds of work that overlaps with denoising another frame: read, write.
     """
 
     milliseconds: dict[str, float] = field(default_factory=dict)
@@ -58,11 +65,45 @@ class Report:
     tiles: str = ""
     history: float | None = None
     fireflies: float = 0.0
+    precision: str = ""
+    model: str = ""
+    repairs: Repairs = field(default_factory=Repairs)
+    repeats: str = ""
+    missing: list[str] = field(default_factory=list)
+    beside: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # These are no dataclass fields, because a written report must not contain them.
         self._asked: list[tuple[Tensor, Tell]] = []
         self._sent: tuple[Tensor, Stopwatch, Moment] | None = None
+
+    @property
+    def replaced_pixels(self) -> int:
+        """Number of pixels of the noisy color that were NaN, infinite, negative or above 1e16."""
+        return self.repairs.pixels
+
+    def __str__(self) -> str:
+        """A few lines: run times, the history, and what was skipped, missing or replaced."""
+        stages = ", ".join(f"{stage} {value:.1f}" for stage, value in self.milliseconds.items())
+        history = "" if self.history is None else f"{self.history:.0%} of the pixels"
+        skipped = (
+            f"{stage.name}{'' if stage.skipped == 1 else f' {stage.skipped:.1%}'} ({stage.reason})"
+            for stage in self.stages.values()
+            if stage.skipped
+        )
+        lines = {
+            "milliseconds": f"{stages}; together {sum(self.milliseconds.values()):.1f}" if stages else "",
+            "history": f"none ({self.reset})" if self.reset else history,
+            "skipped": ", ".join(skipped),
+            "missing": ", ".join(self.missing),
+            "replaced pixels": str(self.replaced_pixels or ""),
+            "fireflies": f"{self.fireflies:.2%} of the light clamped" if self.fireflies > 0 else "",
+            "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
+            "tiles": self.tiles,
+            "precision": self.precision,
+            "model": self.model,
+        }
+        return "\n".join(f"{name}: {text}" for name, text in lines.items() if text)
 
     def add(self, notes: Iterable[Note]) -> None:
         """Add what steps tell; a later note replaces an earlier one of the same name."""

@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from toys import Same, refused, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
-from mcdenoise.models import Accumulated, Demodulated, Output, Report, _report, _times, list_models
+from mcdenoise.models import Accumulated, Demodulated, FrameReport, Output, _report, _times, list_models
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._times import Times
 
@@ -308,7 +308,7 @@ def test_all_are_told_before_one_that_fails_is_heard() -> None:
         told.append(list(numbers))
         raise InputError("no")
 
-    found = Report()
+    found = FrameReport()
     with without_reads():
         found.ask(torch.tensor([1.0, 2.0]), refuse)
         found.ask(torch.tensor(True), lambda numbers: told.append(list(numbers)))

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from toys import Same, frame_of, refused, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, Report, Skipping, Tiled, list_models
+from mcdenoise.models import Accumulated, Demodulated, Exposed, FrameReport, Needs, Output, Skipping, Tiled, list_models
 from mcdenoise.models._layers import REST, closed, fractions, split
 from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.models.noisy import Noisy
@@ -240,12 +240,12 @@ def test_layers_that_half_floats_rounded_sum_to_the_color() -> None:
     frame = frame_of(30, 40)
     parts = torch.rand(3, *frame.color.shape)
     layers = {str(i): part.half().float() for i, part in enumerate(frame.color * parts / parts.sum(0))}
-    complete = closed(frame.replace(color=frame.color.half().float(), layers=layers), Report().ask)
+    complete = closed(frame.replace(color=frame.color.half().float(), layers=layers), FrameReport().ask)
     assert not complete.layers[REST].any()
     total = torch.stack(list(complete.layers.values())).double().sum(0)
     torch.testing.assert_close(total, complete.color.double(), rtol=8 * 2.0**-24, atol=0)
     # A remainder of more than rounding is a layer of its own.
-    dim = closed(frame.replace(layers={"most": 0.99 * frame.color}), Report().ask)
+    dim = closed(frame.replace(layers={"most": 0.99 * frame.color}), FrameReport().ask)
     torch.testing.assert_close(dim.layers[REST], 0.01 * frame.color, rtol=1e-4, atol=1e-6)
 
 

@@ -17,8 +17,8 @@ from mcdenoise.models import (
     Accumulated,
     Chain,
     Demodulated,
+    FrameReport,
     Output,
-    Report,
     Skipping,
     Stage,
     Tiled,
@@ -331,7 +331,7 @@ def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
 # Methods that know nothing of it
 
 
-def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], Report]:
+def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], FrameReport]:
     """Images of a shot, and what was reported of its last frame."""
     state, outputs = None, []
     for frame in frames:

@@ -16,19 +16,19 @@ from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models import (
     Accumulated,
     Demodulated,
+    FrameReport,
     Model,
     Needs,
     Output,
-    Report,
     create_model,
     find_model,
 )
 from mcdenoise.ops._backend import Backend
 
 
-def report_of(output: Output) -> Report:
+def report_of(output: Output) -> FrameReport:
     """What the notes of a step tell."""
-    report = Report()
+    report = FrameReport()
     report.add(output.notes)
     return report
 

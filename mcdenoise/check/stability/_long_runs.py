@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mcdenoise.check.stability._check import DTYPES, name_of
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Output, Report, State
+from mcdenoise.models import Accumulated, FrameReport, Output, State
 from mcdenoise.ops import accumulate
 from mcdenoise.ops.lag import THRESHOLD
 
@@ -234,7 +234,7 @@ class _Shot:
     def accumulate(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """The accumulated color of the next frame, and the length of its history."""
         output, self._state = self._model(frame, self._state)
-        report = Report()
+        report = FrameReport()
         report.add(output.notes)
         self.reset = report.reset
         return output.image, output.stages["length"]
