@@ -17,7 +17,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, Stage, Tiled, parts_of, save_weights
 from mcdenoise.models.cascaded_v2 import PixelNetwork
 
-STAGES = ["validate", "accumulate", "network", "plan", "Chain"]
+STAGES = ["validate", "restore", "accumulate", "plan", "network", "Chain"]
 
 
 def small_model() -> nn.Module:
