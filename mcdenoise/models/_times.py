@@ -6,13 +6,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import nn
 
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Moment, Stopwatch
-from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models._wrapper import Wrapper, name_of
+from mcdenoise.models.chain import Chain
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.oidn import Oidn
 
@@ -101,15 +103,22 @@ class Times:
 
 
 def _stages(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
-    """The wrappers of a model, and the methods inside, with the names of their stages; no method without a wrapper."""
+    """The wrappers of a model, and the methods inside and in chains, with the names of their stages."""
     for part in model.modules() if isinstance(model, nn.Module) else ():
-        if isinstance(part, Wrapper):
-            inner = part.inner
-            if isinstance(inner, Wrapper) or not isinstance(inner, nn.Module):
-                yield part, part.stage
-                continue
-            learnt = isinstance(inner, Oidn) or next(inner.parameters(), None) is not None
-            method = "network" if learnt else name
+        if isinstance(part, Chain):
+            yield from ((method, _stage(method, name_of(method))) for method in part.children() if _is_method(method))
+        elif isinstance(part, Wrapper):
+            inner: object = part.inner
+            method = _stage(inner, name) if _is_method(inner) else part.stage
             # Demodulated calls what is inside without its hooks, and takes hardly any time itself.
             yield part, method if isinstance(part, Demodulated) else part.stage
-            yield inner, method
+            if isinstance(inner, nn.Module) and _is_method(inner):
+                yield inner, method
+
+
+def _is_method(thing: object) -> bool:
+    return isinstance(thing, nn.Module) and not isinstance(thing, Wrapper | Chain)
+
+
+def _stage(method: Any, name: str) -> str:
+    return "network" if isinstance(method, Oidn) or next(method.parameters(), None) is not None else name
