@@ -106,7 +106,8 @@ def _stages(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
     """The wrappers of a model, and the methods inside and in chains, with the names of their stages."""
     for part in model.modules() if isinstance(model, nn.Module) else ():
         if isinstance(part, Chain):
-            yield from ((method, _stage(method, name_of(method))) for method in part.children() if _is_method(method))
+            own: Iterator[Any] = part.children()
+            yield from ((each, _stage(each, name_of(each))) for each in own if _is_method(each))
         elif isinstance(part, Wrapper):
             inner: object = part.inner
             method = _stage(inner, name) if _is_method(inner) else part.stage
