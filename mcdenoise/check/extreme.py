@@ -17,9 +17,10 @@ import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from mcdenoise.check.case import Case, Inputs, Rounding, map_tensors, normal, radiance, uniform
+from mcdenoise.ops._constants import FARTHEST_FEATURE
 from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z
 from mcdenoise.ops._window import Border, inside, offsets, pad, shifted, unpad
-from mcdenoise.ops.affinity import affinity_of, tap_of, taps_of
+from mcdenoise.ops.affinity import tap_of, taps_of
 from mcdenoise.ops.bilateral import cross_bilateral_weights
 from mcdenoise.ops.fireflies import clamp_fireflies
 from mcdenoise.ops.gradients import sums_of_strata
@@ -631,7 +632,9 @@ def affinity_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
         known = tensors["previous_weight"] if name else torch.ones_like(bandwidth)
         padded, inside = (F.pad(each, (radius,) * 4) for each in (there, known))
         for at in taps_of(**settings, skip_center=not name):
-            difference, distance, weight = affinity_of(here, padded, bandwidth, *at)
+            difference = (here - tap_of(padded, here, *at)).clamp(-FARTHEST_FEATURE, FARTHEST_FEATURE)
+            distance = difference.square().sum(1, keepdim=True)
+            weight = torch.exp(-bandwidth * distance)
             counts = tap_of(inside, here, *at)
             gone = torch.where(weight < limits.tiny, weight / limits.eps, 0)
             total, lost = total + counts * weight, lost + counts * gone * brightest

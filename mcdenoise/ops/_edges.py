@@ -66,7 +66,7 @@ def edge_average(
     return average(image, noise, normal, depth, bright, deviation, list(kernel), step, sigma_z, sigma_n)
 
 
-@op("numba", differentiable=True)
+@op("numba")
 def average(
     image: Tensor,
     noise: Tensor,

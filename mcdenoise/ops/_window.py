@@ -57,6 +57,14 @@ def _fold_edges(padded: Tensor, radius: int, size: int, dim: int) -> Tensor:
     return inner + torch.cat([before, zeros], dim) + torch.cat([zeros, after], dim)
 
 
+def taps(image: Tensor, kernel_size: int, border: Border) -> Iterator[Tensor]:
+    """The image as each tap of the window sees it, as views of one padded copy."""
+    radius = kernel_size // 2
+    padded = pad(image, radius, border)
+    for _, dy, dx in offsets(kernel_size):
+        yield shifted(padded, radius, dy, dx, *image.shape[-2:])
+
+
 def offsets(kernel_size: int) -> Iterator[tuple[int, int, int]]:
     """Index, row offset and column offset of every tap, row by row from the top left."""
     radius = kernel_size // 2

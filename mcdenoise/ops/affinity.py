@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._constants import FARTHEST_FEATURE, LEAST_CENTER
+from mcdenoise.ops._distance import squared_distance
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
@@ -55,7 +53,7 @@ def _check(
         raise ValueError(f"{absent}: expected with {next(iter(given))}, found None")
 
 
-@op("numba", check=_check, differentiable=True)
+@op("numba", check=_check)
 def affinity_filter(
     image: Tensor,
     features: Tensor,
@@ -100,8 +98,8 @@ def affinity_filter(
         TypeError: an argument is no floating-point tensor.
         ValueError: shapes disagree, a setting does not fit, or an argument about the frame before is missing.
 
-    Differentiable in all tensors, to any order, where ``center`` is above 1e-6. The derivative keeps the arguments, but
-    no weights of taps, and costs about three times the filter.
+    Differentiable in all tensors, to any order, where ``center`` is above 1e-6. The derivative keeps two numbers for
+    each tap of each pixel.
 
     Source: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of Neural Features": the equations of
     its pairwise affinity, of the dilated filters, and of the temporal one. ``previous_weight`` and the smallest weight
@@ -117,15 +115,15 @@ def affinity_filter(
     if image.numel() == 0:
         return image
     dtype = accumulator_dtype(image.dtype)
-    values, here, own = (each.to(dtype) for each in (image, features, center))
+    values, here, own, near = (each.to(dtype) for each in (image, features, center, bandwidth))
     # The last channel sums the weights: outside the image it is 0, like all others.
     values = torch.cat([values, torch.ones_like(own)], 1)
     sums = own.clamp_min(LEAST_CENTER) * values
-    sums = sums + _affine(here, here, values, bandwidth, kernel_size, dilation, skip_center=True)
+    sums = sums + _affine(here, here, values, near, kernel_size, dilation, skip_center=True)
     there, width, known = previous_features, previous_bandwidth, previous_weight
     if previous is not None and there is not None and width is not None and known is not None:
         weighed = torch.cat([previous.to(dtype) * known.to(dtype), known.to(dtype)], 1)
-        sums = sums + _affine(here, there.to(dtype), weighed, width, kernel_size, dilation, skip_center=False)
+        sums = sums + _affine(here, there.to(dtype), weighed, width.to(dtype), kernel_size, dilation, skip_center=False)
     return (sums[:, :-1] / sums[:, -1:]).to(image.dtype)
 
 
@@ -142,78 +140,14 @@ def _affine(
     *,
     skip_center: bool,
 ) -> Tensor:
+    """``sum_q exp(-a[p] |f[p] - g[q]|^2) v[q]``."""
     radius = kernel_size // 2 * dilation
-    padded = pad(there, radius, "zeros"), pad(values, radius, "zeros")
-    return _Affine.of(here, *padded, bandwidth.to(here.dtype), kernel_size, dilation, skip_center)
-
-
-class _Affine(Function):
-    """``sum_q exp(-a[p] |f[p] - g[q]|^2) v[q]``, in passes over the taps, with no stack of them.
-
-    Its derivatives compute the weights once more; they are plain torch, recorded only when a second derivative is asked
-    for.
-    """
-
-    @staticmethod
-    def forward(
-        here: Tensor, there: Tensor, values: Tensor, bandwidth: Tensor, kernel_size: int, dilation: int, skip: bool
-    ) -> Tensor:
-        total = values.new_zeros(*values.shape[:2], *here.shape[-2:])
-        for dy, dx in taps_of(kernel_size, dilation, skip):
-            _, _, weight = affinity_of(here, there, bandwidth, dy, dx)
-            total.addcmul_(weight, tap_of(values, here, dy, dx))
-        return total
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
-        *tensors, ctx.kernel_size, ctx.dilation, ctx.skip = inputs
-        ctx.save_for_backward(*tensors)
-        ctx.save_for_forward(*tensors)
-
-    @staticmethod
-    def tangent(
-        ctx: Any,
-        of_here: Tensor | None,
-        of_there: Tensor | None,
-        of_values: Tensor | None,
-        of_bandwidth: Tensor | None,
-        *_: None,
-    ) -> Tensor:
-        here, there, values, bandwidth = ctx.saved_tensors
-        total: Tensor = values.new_zeros(*values.shape[:2], *here.shape[-2:])
-        for dy, dx in taps_of(ctx.kernel_size, ctx.dilation, ctx.skip):
-            difference, distance, weight = affinity_of(here, there, bandwidth, dy, dx)
-            of_exponent = torch.zeros_like(weight)
-            if of_bandwidth is not None:
-                of_exponent = of_exponent - distance * of_bandwidth
-            if of_here is not None:
-                of_exponent = of_exponent - 2 * bandwidth * (difference * of_here).sum(1, keepdim=True)
-            if of_there is not None:
-                moved = tap_of(of_there, here, dy, dx)
-                of_exponent = of_exponent + 2 * bandwidth * (difference * moved).sum(1, keepdim=True)
-            total = total + weight * of_exponent * tap_of(values, here, dy, dx)
-            if of_values is not None:
-                total = total + weight * tap_of(of_values, here, dy, dx)
-        return total
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        saved = ctx.saved_tensors
-        here, there, values, bandwidth = saved
-        # Under vmap each result must have the axis of whichever of these has one.
-        none = gradient.new_zeros(())
-        for each in saved:
-            none = none + each.new_zeros(())
-        to_here, to_there, to_values, to_bandwidth = (torch.zeros_like(each) + none for each in saved)
-        for dy, dx in taps_of(ctx.kernel_size, ctx.dilation, ctx.skip):
-            difference, distance, weight = affinity_of(here, there, bandwidth, dy, dx)
-            of_exponent = weight * (gradient * tap_of(values, here, dy, dx)).sum(1, keepdim=True)
-            pull = (2 * of_exponent * bandwidth) * difference
-            to_bandwidth = to_bandwidth - of_exponent * distance
-            to_here = to_here - pull
-            tap_of(to_there, here, dy, dx).add_(pull)
-            tap_of(to_values, here, dy, dx).add_(weight * gradient)
-        return to_here, to_there, to_values, to_bandwidth, None, None, None
+    padded, padded_values = pad(there, radius, "zeros"), pad(values, radius, "zeros")
+    total = torch.zeros_like(values)
+    for dy, dx in taps_of(kernel_size, dilation, skip_center):
+        distance = squared_distance(here, tap_of(padded, here, dy, dx), FARTHEST_FEATURE)
+        total = total + torch.exp(-bandwidth * distance) * tap_of(padded_values, here, dy, dx)
+    return total
 
 
 def taps_of(kernel_size: int, dilation: int, skip_center: bool) -> list[tuple[int, int]]:
@@ -226,10 +160,3 @@ def tap_of(padded: Tensor, image: Tensor, dy: int, dx: int) -> Tensor:
     """The view of ``padded`` in which each pixel of ``image`` shows the tap at that offset."""
     height, width = image.shape[-2:]
     return shifted(padded, (padded.shape[-2] - height) // 2, dy, dx, height, width)
-
-
-def affinity_of(here: Tensor, there: Tensor, bandwidth: Tensor, dy: int, dx: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The difference of the features here and at a tap, its square, and the weight."""
-    difference = (here - tap_of(there, here, dy, dx)).clamp(-FARTHEST_FEATURE, FARTHEST_FEATURE)
-    distance = difference.square().sum(1, keepdim=True)
-    return difference, distance, torch.exp(-bandwidth * distance)

@@ -120,7 +120,7 @@ class Atrous(nn.Module):
         return atrous(light, variance, normal, depth, step=self.step, **sigmas)
 
 
-@op("numba", differentiable=True)
+@op("numba")
 def blurred(variance: Tensor) -> Tensor:
     """``g`` of Eq. 5; the border is repeated."""
     # This imports all of kornia, which takes as long as denoising a frame.

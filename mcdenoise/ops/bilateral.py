@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._guides import padded_gradient, squared_distance
+from mcdenoise.ops._distance import squared_distance
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import (
     Border,
@@ -19,8 +18,7 @@ from mcdenoise.ops._window import (
     inside,
     kernel_size_of,
     offsets,
-    pad,
-    shifted,
+    taps,
 )
 
 Normalize = Literal["softmax", "none"]
@@ -75,10 +73,9 @@ def cross_bilateral_weights(
         [0.5, 0.5, 0.0]
     """
     kernel_size = check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
-    radius = kernel_size // 2
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
-    exponent = _exponent(start, guides, falloffs, distance_falloff, radius, border)
+    exponent = _exponent(start, guides, falloffs, distance_falloff, kernel_size, border)
     if log_domain:
         if border == "renormalize":
             exponent = torch.where(_inside(kernel, kernel_size), exponent, -torch.inf)
@@ -137,123 +134,25 @@ def _exponent(
     guides: Sequence[Tensor],
     falloffs: Sequence[Tensor],
     distance_falloff: Tensor | None,
-    radius: int,
+    kernel_size: int,
     border: Border,
 ) -> Tensor:
     """``start - sum_g f_g |difference of g|^2 - f_d |offset|^2``, in the dtype in which sums are kept."""
     dtype = accumulator_dtype(start.dtype)
-    channels = tuple(guide.shape[1] for guide in guides)
-    # One tensor for all guides: torch.compile takes no function with a variable number of arguments.
-    margin = pad(torch.cat([guide.to(dtype) for guide in guides], 1), radius, border) if guides else None
-    factors = torch.cat([falloff.to(dtype) for falloff in falloffs], 1) if falloffs else None
-    distance = None if distance_falloff is None else distance_falloff.to(dtype)
-    return _Exponent.of(start, distance, margin, factors, channels, radius)
-
-
-class _Exponent(Function):
-    """:func:`_exponent` of padded, concatenated guides in one pass over the taps, with no stack of them."""
-
-    @staticmethod
-    def forward(
-        start: Tensor,
-        distance_falloff: Tensor | None,
-        guides: Tensor | None,
-        falloffs: Tensor | None,
-        channels: tuple[int, ...],
-        radius: int,
-    ) -> Tensor:
-        height, width = start.shape[-2:]
-        # One plane after the other, whatever the layout of the kernel: every tap is updated on its own. The copy that
-        # this takes makes infinite logits finite, so that the weight of each of two of them is not NaN, but half.
-        dtype = accumulator_dtype(start.dtype)
-        largest = torch.finfo(dtype).max
-        result = start.to(dtype, memory_format=torch.contiguous_format).clamp(-largest, largest)
-        for tap, dy, dx in offsets(2 * radius + 1):
-            out = result[:, tap : tap + 1]
-            if dy == 0 and dx == 0:
-                continue
-            for padded, falloff in _each(guides, falloffs, channels):
-                out.addcmul_(falloff, squared_distance(padded, radius, dy, dx, height, width), value=-1)
+    # Infinite logits are finite here, so that the weight of each of two of them is not NaN, but half.
+    largest = torch.finfo(dtype).max
+    centres = [guide.to(dtype) for guide in guides]
+    scales = [falloff.to(dtype) for falloff in falloffs]
+    logits = start.to(dtype).clamp(-largest, largest).split(1, 1)
+    moved = [taps(centre, kernel_size, border) for centre in centres]
+    exponents = []
+    for exponent, (_, dy, dx) in zip(logits, offsets(kernel_size), strict=True):
+        seen = [next(each) for each in moved]
+        # The middle of the window is no distance away.
+        if (dy, dx) != (0, 0):
+            for scale, tap, centre in zip(scales, seen, centres, strict=True):
+                exponent = exponent - scale * squared_distance(tap, centre)
             if distance_falloff is not None:
-                out.sub_(distance_falloff, alpha=dy * dy + dx * dx)
-        return result
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Tensor) -> None:
-        start, _, guides, falloffs, ctx.channels, ctx.radius = inputs
-        ctx.dtype = start.dtype
-        ctx.save_for_backward(guides, falloffs)
-        ctx.save_for_forward(guides, falloffs)
-
-    @staticmethod
-    def tangent(
-        ctx: Any,
-        of_start: Tensor | None,
-        of_distance: Tensor | None,
-        of_guides: Tensor | None,
-        of_scales: Tensor | None,
-        *_: None,
-    ) -> Tensor:
-        radius = ctx.radius
-        guides, falloffs = ctx.saved_tensors
-        given = next(tangent for tangent in (of_start, of_distance, of_scales, of_guides) if tangent is not None)
-        margin = 2 * radius if given is of_guides else 0
-        height, width = given.shape[-2] - margin, given.shape[-1] - margin
-        pairs = _each(guides, falloffs, ctx.channels)
-        tangents = zip(
-            [None] * len(pairs) if of_guides is None else torch.split(of_guides, list(ctx.channels), 1),
-            [None] * len(pairs) if of_scales is None else torch.split(of_scales, 1, 1),
-            strict=True,
-        )
-        moving = list(zip(pairs, tangents, strict=True))
-        taps = []
-        for tap, dy, dx in offsets(2 * radius + 1):
-            total = given.new_zeros(given.shape[0], 1, height, width, dtype=accumulator_dtype(ctx.dtype))
-            if of_start is not None:
-                total = total + of_start[:, tap : tap + 1]
-            if of_distance is not None:
-                total = total - of_distance * (dy * dy + dx * dx)
-            for (padded, falloff), (of_padded, of_falloff) in moving:
-                size = (height, width)
-                difference = shifted(padded, radius, dy, dx, *size) - shifted(padded, radius, 0, 0, *size)
-                if of_falloff is not None:
-                    total = total - of_falloff * difference.square().sum(1, keepdim=True)
-                if of_padded is not None:
-                    change = shifted(of_padded, radius, dy, dx, *size) - shifted(of_padded, radius, 0, 0, *size)
-                    total = total - 2 * falloff * (difference * change).sum(1, keepdim=True)
-            taps.append(total)
-        return torch.cat(taps, 1)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        # Plain differentiable torch: recorded only when a second derivative is asked for.
-        radius = ctx.radius
-        _, need_distance, need_guides, need_scales, *_ = ctx.needs_input_grad
-        guides, falloffs = ctx.saved_tensors
-        pairs = _each(guides, falloffs, ctx.channels)
-        to_distance = to_guides = to_scales = None
-        if need_distance:
-            to_distance = torch.zeros_like(gradient[:, :1])
-            for tap, dy, dx in offsets(2 * radius + 1):
-                to_distance = torch.sub(to_distance, gradient[:, tap : tap + 1], alpha=dy * dy + dx * dx)
-        if need_guides:
-            to_guides = torch.cat([padded_gradient(gradient, padded, falloff, radius) for padded, falloff in pairs], 1)
-        if need_scales:
-            to_scales = torch.cat([_scale_gradient(gradient, padded, radius) for padded, _ in pairs], 1)
-        return gradient.to(ctx.dtype), to_distance, to_guides, to_scales, None, None
-
-
-def _each(guides: Tensor | None, falloffs: Tensor | None, channels: tuple[int, ...]) -> list[tuple[Tensor, Tensor]]:
-    """Each guide with its falloff."""
-    if guides is None or falloffs is None:
-        return []
-    return list(zip(torch.split(guides, list(channels), 1), torch.split(falloffs, 1, 1), strict=True))
-
-
-def _scale_gradient(gradient: Tensor, padded: Tensor, radius: int) -> Tensor:
-    height, width = gradient.shape[-2:]
-    total = torch.zeros_like(gradient[:, :1])
-    for tap, dy, dx in offsets(2 * radius + 1):
-        distance = squared_distance(padded, radius, dy, dx, height, width)
-        total = torch.addcmul(total, gradient[:, tap : tap + 1], distance, value=-1)
-    return total
+                exponent = exponent - (dy * dy + dx * dx) * distance_falloff.to(dtype)
+        exponents.append(exponent)
+    return torch.cat(exponents, 1)

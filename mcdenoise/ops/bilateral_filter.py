@@ -28,7 +28,7 @@ def _check(
     check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
 
 
-@op("numba", check=_check, differentiable=True)
+@op("numba", check=_check)
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,
@@ -43,7 +43,7 @@ def cross_bilateral_filter(
 
     ``out[p] = sum_t w'[t, p] * image[p + o_t]`` with the weights ``w'`` of :func:`cross_bilateral_weights`: it is
     ``kernel_conv(image, cross_bilateral_weights(kernel, guides, ...))``, except that the weights are never rounded to
-    half precision. The fast backends never store them either, and compute them once more for the derivatives.
+    half precision. The fast backend never stores them either.
 
     Args:
         image: ``(B, C, H, W)``, any unit and range.
@@ -63,8 +63,7 @@ def cross_bilateral_filter(
         TypeError: an argument is no floating-point tensor.
         ValueError: shapes disagree, ``K`` is even, the numbers of guides and falloffs differ, or a mode is unknown.
 
-    Differentiable in ``image``, ``kernel``, ``guides``, ``falloffs`` and ``distance_falloff``, to any order; second
-    derivatives are computed in plain torch.
+    Differentiable in ``image``, ``kernel``, ``guides``, ``falloffs`` and ``distance_falloff``, to any order.
 
     Source: the paper's Eqs. 4-8; Eisemann and Durand 2004, Petschnigg et al. 2004 (cross/joint bilateral filter).
 

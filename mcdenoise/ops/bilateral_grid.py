@@ -42,7 +42,7 @@ def _check_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CEL
         )
 
 
-@op("numba", check=_check_splat, differentiable=True)
+@op("numba", check=_check_splat)
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
     """Average an image in the cells of a bilateral grid: blocks of pixels, separated by the value of a guide.
 
@@ -98,7 +98,7 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
     return grid.to(image.dtype), filled.to(image.dtype)
 
 
-@op("numba", check=_check_slice, differentiable=True)
+@op("numba", check=_check_slice)
 def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> Tensor:
     """Read an image out of a bilateral grid: at each pixel the mean of the eight cells around its place and its guide.
 

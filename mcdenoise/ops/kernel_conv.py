@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op
@@ -19,7 +17,7 @@ from mcdenoise.ops._window import (
     kernel_size_of,
     offsets,
     pad,
-    shifted,
+    taps,
     unpad,
 )
 
@@ -30,7 +28,7 @@ def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
     kernel_size_of(sizes["T"], "kernel")
 
 
-@op("numba", check=_check, differentiable=True)
+@op("numba", check=_check)
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
 
@@ -52,8 +50,8 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
         TypeError: an argument is no floating-point tensor.
         ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
 
-    Differentiable in ``image`` and ``kernel``, to any order; second derivatives are computed in plain torch. Memory
-    beyond the result is at most a padded copy of ``image``.
+    Differentiable in ``image`` and ``kernel``, to any order. Memory beyond the result is at most a padded copy of
+    ``image``.
 
     Source: the paper's Eq. 4; Bako et al. 2017, "Kernel-predicting convolutional networks for denoising Monte Carlo
     renderings", Eq. 9.
@@ -65,16 +63,18 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
         5.0
     """
     kernel_size = kernel_size_of(kernel.shape[1], "kernel")
-    radius = kernel_size // 2
-    if border != "renormalize":
-        return _Gather.of(pad(image, radius, border), kernel)
-    # The mean of a few large values fits where their sum does not, and the gradient where its two terms do not.
-    kernel = kernel.to(accumulator_dtype(kernel.dtype))
-    total = _Gather.of(pad(image.to(accumulator_dtype(image.dtype)), radius, border), kernel)
-    return _renormalized(total, kernel, kernel_size).to(image.dtype)
+    dtype = accumulator_dtype(image.dtype)
+    source = image.to(dtype)
+    total = torch.zeros_like(source)
+    for weight, tap in zip(kernel.split(1, 1), taps(source, kernel_size, border), strict=True):
+        total = total + weight.to(dtype) * tap
+    if border == "renormalize":
+        # The mean of a few large values fits where their sum does not.
+        total = _renormalized(total, kernel.to(accumulator_dtype(kernel.dtype)), kernel_size)
+    return total.to(image.dtype)
 
 
-@op("numba", check=_check, differentiable=True)
+@op(check=_check)
 def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Spread every pixel over its neighbours with a kernel of its own: the transpose of :func:`kernel_conv`.
 
@@ -97,7 +97,7 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
         TypeError: an argument is no floating-point tensor.
         ValueError: shapes disagree, ``K`` is even, or ``border`` is unknown.
 
-    Differentiable in ``image`` and ``kernel``, to any order; second derivatives are computed in plain torch.
+    Differentiable in ``image`` and ``kernel``, to any order.
 
     Source: Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network", Eq. 3.
 
@@ -111,9 +111,12 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
     radius = kernel_size // 2
     source = image.to(accumulator_dtype(image.dtype))
     if border == "renormalize":
-        kernel = kernel.to(accumulator_dtype(kernel.dtype))
-        source = _renormalized(source, kernel, kernel_size)
-    return unpad(_Splat.of(source, kernel), radius, border).to(image.dtype)
+        source = _renormalized(source, kernel.to(accumulator_dtype(kernel.dtype)), kernel_size)
+    total = pad(torch.zeros_like(source), radius, "zeros")
+    for weight, (_, dy, dx) in zip(kernel.split(1, 1), offsets(kernel_size), strict=True):
+        margin = radius + dx, radius - dx, radius + dy, radius - dy
+        total = total + F.pad(weight.to(source.dtype) * source, margin)
+    return unpad(total, radius, border).to(image.dtype)
 
 
 KernelConv = module_of("KernelConv", kernel_conv, check_border)
@@ -127,109 +130,3 @@ def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:
     empty = total == 0
     # Divided, because the reciprocal of a very small sum is infinite.
     return torch.where(empty, 0, values / torch.where(empty, 1, total))
-
-
-# Gather, splat and correlate are the three bilinear maps of one trilinear form, sum_{t,p,c} k[t,p] y[c,p] x[c,p+o_t]:
-# the derivatives of each are the other two, and its tangent is that of its arguments in turn. As loops over the taps
-# with these derivatives, none of them ever holds K*K copies of the image, and gradients of any order come for free.
-
-
-def _tangent(
-    function: type[Function], arguments: tuple[Tensor, Tensor], tangents: tuple[Tensor | None, Tensor | None]
-) -> Tensor:
-    """The tangent of a bilinear map."""
-    of_first, of_second = tangents
-    if of_first is None:
-        assert of_second is not None
-        return function.of(arguments[0], of_second)
-    moved = function.of(of_first, arguments[1])
-    return moved if of_second is None else moved + function.of(arguments[0], of_second)
-
-
-class _Gather(Function):
-    @staticmethod
-    def forward(padded: Tensor, kernel: Tensor) -> Tensor:
-        kernel_size = kernel_size_of(kernel.shape[1], "kernel")
-        height, width = kernel.shape[-2:]
-        dtype = accumulator_dtype(padded.dtype)
-        source = padded.to(dtype)
-        total = source.new_zeros(*padded.shape[:2], height, width)
-        for tap, dy, dx in offsets(kernel_size):
-            total.addcmul_(kernel[:, tap : tap + 1].to(dtype), shifted(source, kernel_size // 2, dy, dx, height, width))
-        return total.to(padded.dtype)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def tangent(ctx: Any, of_padded: Tensor | None, of_kernel: Tensor | None) -> Tensor:
-        return _tangent(_Gather, ctx.saved_tensors, (of_padded, of_kernel))
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        padded, kernel = ctx.saved_tensors
-        to_image = _Splat.of(gradient, kernel) if ctx.needs_input_grad[0] else None
-        to_kernel = _Correlate.of(gradient, padded).to(kernel.dtype) if ctx.needs_input_grad[1] else None
-        return to_image, to_kernel
-
-
-class _Splat(Function):
-    @staticmethod
-    def forward(image: Tensor, kernel: Tensor) -> Tensor:
-        kernel_size = kernel_size_of(kernel.shape[1], "kernel")
-        radius = kernel_size // 2
-        height, width = kernel.shape[-2:]
-        dtype = accumulator_dtype(image.dtype)
-        source = image.to(dtype)
-        total = source.new_zeros(*image.shape[:2], height + 2 * radius, width + 2 * radius)
-        for tap, dy, dx in offsets(kernel_size):
-            shifted(total, radius, dy, dx, height, width).addcmul_(kernel[:, tap : tap + 1].to(dtype), source)
-        return total.to(image.dtype)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def tangent(ctx: Any, of_image: Tensor | None, of_kernel: Tensor | None) -> Tensor:
-        return _tangent(_Splat, ctx.saved_tensors, (of_image, of_kernel))
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        image, kernel = ctx.saved_tensors
-        to_image = _Gather.of(gradient, kernel) if ctx.needs_input_grad[0] else None
-        to_kernel = _Correlate.of(image, gradient).to(kernel.dtype) if ctx.needs_input_grad[1] else None
-        return to_image, to_kernel
-
-
-class _Correlate(Function):
-    @staticmethod
-    def forward(image: Tensor, padded: Tensor) -> Tensor:
-        height, width = image.shape[-2:]
-        radius = (padded.shape[-2] - height) // 2
-        kernel_size = 2 * radius + 1
-        dtype = accumulator_dtype(image.dtype)
-        source, other = image.to(dtype), padded.to(dtype)
-        result = source.new_empty(image.shape[0], kernel_size * kernel_size, height, width)
-        for tap, dy, dx in offsets(kernel_size):
-            result[:, tap] = (source * shifted(other, radius, dy, dx, height, width)).sum(1)
-        return result
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def tangent(ctx: Any, of_image: Tensor | None, of_padded: Tensor | None) -> Tensor:
-        return _tangent(_Correlate, ctx.saved_tensors, (of_image, of_padded))
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        image, padded = ctx.saved_tensors
-        to_image = _Gather.of(padded, gradient) if ctx.needs_input_grad[0] else None
-        to_padded = _Splat.of(image, gradient) if ctx.needs_input_grad[1] else None
-        return to_image, to_padded

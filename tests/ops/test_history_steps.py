@@ -13,8 +13,7 @@ from reference_cases import by, channels_last, every_other_column, slice_of_pixe
 from torch import Tensor
 
 from mcdenoise.ops import Surface, clamp_fireflies, demodulate, motion_from_position, use
-from mcdenoise.ops._numba import _runtime, temporal
-from mcdenoise.ops._numba import history as fast
+from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import history as steps
 
 SIZE = (37, 23)
@@ -372,19 +371,3 @@ def test_pixels_that_found_their_surface_are_counted_image_by_image(backend: Any
     surfaces = (Surface(depth=depth), Surface(depth=before))
     blended = by(backend, steps.blend)(color, color, depth, None, *surfaces)
     torch.testing.assert_close(blended.kept, torch.tensor([1.0, 0.7]))
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_operators_agree_with_their_schemas() -> None:
-    frame = WAYS["motion"][0]
-    image, length = torch.rand(2, 1, 9, *SIZE), torch.full((1, 1, *SIZE), 5.0)
-    surface = [frame.position, frame.normal, frame.depth, length.round()]
-    blended = (image[0, :, :5], image[1], length, frame.motion, surface, surface, 0.1, False, 0.02, 0.5, 0.25)
-    for operator, arguments in (
-        (fast._enter, (frame.color, frame.albedo, length.new_full((1,), 30.0), 7, True)),
-        (temporal.motion_from_position, (frame.position, frame.view_projection)),
-        (temporal._blend, (*blended, frame.albedo, 3.0, 0.05)),
-        (fast._find_lights, (image[0, :, 3:4], 0.03, 1.2, 9)),
-        (fast._discard_lag, (image[0], length, image[1, :, :5].contiguous(), 2.0, 5, 0.25, 7.0)),
-    ):
-        torch.library.opcheck(operator._overload, arguments, test_utils=("test_schema", "test_faketensor"))

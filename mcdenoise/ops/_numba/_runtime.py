@@ -6,10 +6,12 @@ import functools
 import hashlib
 import math
 import os
-import sys
-from collections.abc import Callable, Iterator
+import pickle
+import secrets
+import stat
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +19,57 @@ import numba
 import numpy as np
 import torch
 from numba import types
+from numba.core.caching import FunctionCache
 from numba.extending import overload
 from torch import Tensor
-
-from mcdenoise.ops._numba._cache import VerifiedCache
 
 # Numba takes settings from a file in the working folder, too, which has no say in the folder of compiled code.
 numba.config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR", "")  # type: ignore[attr-defined]
 # Handing rows to a thread takes as long as filtering some thousand pixels, or this many times as many pixels if there
 # are a few operations for each.
 PIXELS_A_THREAD, LIGHT = 16384, 4
-# If no number of an image is larger, numbers below the smallest normal one may matter.
-_ORDINARY = 1e-15
 
 # A tensor as numba sees it: its memory from the first element on, strides in elements, and number of channels.
 Source = tuple[Any, tuple[int, ...], int]
+
+
+class _Cache(FunctionCache):
+    """Numba's cache, which fails for no run: not by a file that is cut off, a full disk, or a folder of somebody else.
+
+    Its files are pickles, and loading one runs what is in it.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        # Of two processes that write at once neither overwrites code that the other one enters in the index.
+        own = f"{self._impl.filename_base}.{secrets.token_hex(4)}"
+        self._cache_file._data_name_pattern = own + ".{number:d}.nbc"
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        with suppress(Exception):
+            if _is_own(self._cache_path):
+                return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(Exception):
+            self._impl.locator.ensure_cache_path()
+            if not _is_own(self._cache_path):
+                return
+            try:
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            except (EOFError, ValueError, pickle.PickleError):
+                # The index is damaged.
+                self.flush()  # type: ignore[no-untyped-call]
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+
+def _is_own(folder: str) -> bool:
+    """Whether nobody writes into a folder who could not change this package too."""
+    if os.name != "posix":
+        return True
+    found = os.stat(folder)
+    return found.st_uid in (0, os.getuid(), os.stat(__file__).st_uid) and not found.st_mode & stat.S_IWOTH
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -44,7 +82,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     kernel: Any = numba.njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)
     # Where no such folder can be written to, it is compiled anew in every run.
     with suppress(RuntimeError):
-        kernel._cache = VerifiedCache(function)  # type: ignore[no-untyped-call]
+        kernel._cache = _Cache(function)
     return kernel
 
 
@@ -111,26 +149,6 @@ def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool 
 def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     """Threads that stay: to start one takes longer than many a kernel. A forked process has none of its parent's."""
     return ThreadPoolExecutor(workers, thread_name_prefix="mcdenoise-rows")
-
-
-def flushing(*images: Tensor) -> Callable[[], AbstractContextManager[None]]:
-    """Make contexts in which this thread computes denormal numbers as 0, if all images have ordinary numbers.
-
-    Denormal numbers, such as small weights of small gradients, take far longer than others. Beside ordinary numbers
-    they do not matter; in an image of only small numbers they may be all there is.
-    """
-    ordinary = all(float(torch.stack(torch.aminmax(image)).abs().amax()) > _ORDINARY for image in images)
-    return _denormals_flushed if ordinary else nullcontext
-
-
-@contextmanager
-def _denormals_flushed() -> Iterator[None]:
-    already = sys.float_info.min / 2 == 0
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(already)
 
 
 def load(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The Gaussian of the a-trous filter as a torch operator with derivatives."""
+"""The Gaussian of the a-trous filter ."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._numba._runtime import compiled, share_rows
-from mcdenoise.ops._operator import custom_op
 
 
-@custom_op("mcdenoise::blurred", device_types="cpu", schema="(Tensor variance) -> Tensor")
 def blurred(variance: Tensor) -> Tensor:
     """See :func:`mcdenoise.ops.atrous.blurred`."""
     result = torch.empty(variance.shape, dtype=variance.dtype, device="cpu")
@@ -20,16 +18,6 @@ def blurred(variance: Tensor) -> Tensor:
         arrays = result.numpy(), variance.detach().contiguous().numpy()
         share_rows(variance, lambda *rows: _blur(*arrays, *rows))
     return result
-
-
-@blurred.register_fake
-def _(variance: Tensor) -> Tensor:
-    return variance.new_empty(variance.shape)
-
-
-def blurred_gradients(needed: tuple[Any, ...], gradient: Tensor, variance: Tensor) -> tuple[Tensor]:
-    """Its matrix is symmetric, with the border repeated, too."""
-    return (blurred(gradient),)
 
 
 @compiled

@@ -5,27 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mcdenoise.ops._numba._runtime import compiled, read_row, readable, share_rows, source
-from mcdenoise.ops._operator import custom_op
 from mcdenoise.ops._window import accumulator_dtype
 
 
-@custom_op("mcdenoise::downsample", device_types="cpu", schema="(Tensor image) -> Tensor")
 def downsample(image: Tensor) -> Tensor:
     """See :func:`mcdenoise.ops.downsample`."""
-    result = _empty_half(image).to(accumulator_dtype(image.dtype))
+    batch, channels, height, width = image.shape
+    shape = batch, channels, (height + 1) // 2, (width + 1) // 2
+    result = torch.empty(shape, dtype=accumulator_dtype(image.dtype), device="cpu")
     if result.numel():
-        arguments = (result.numpy(), source(readable(image, result.dtype)), *image.shape[2:])
+        arguments = (result.numpy(), source(readable(image, result.dtype)), height, width)
         share_rows(result, lambda *rows: _halve(*arguments, *rows), light=True)
     return result.to(image.dtype)
-
-
-@downsample.register_fake
-def _empty_half(image: Tensor) -> Tensor:
-    batch, channels, height, width = image.shape
-    return image.new_empty((batch, channels, (height + 1) // 2, (width + 1) // 2))
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""The importance filter as a torch operator, without derivatives.
+"""The importance filter.
 
 A window is a column of rows. Each row of each pixel is averaged once, and these means wait in a ring as long as a
 window needs them, each with the largest importance in it and the sum of the weights beside that.
@@ -23,15 +23,9 @@ from mcdenoise.ops._numba._runtime import (
     share_rows,
     source,
 )
-from mcdenoise.ops._operator import custom_op
 from mcdenoise.ops._window import accumulator_dtype
 
 
-@custom_op(
-    "mcdenoise::importance_filter",
-    device_types="cpu",
-    schema="(Tensor image, Tensor importance, int kernel_size) -> Tensor",
-)
 def importance_filter(image: Tensor, importance: Tensor, kernel_size: int) -> Tensor:
     """See :func:`mcdenoise.ops.importance_filter`."""
     dtype = torch.promote_types(accumulator_dtype(image.dtype), accumulator_dtype(importance.dtype))
@@ -40,11 +34,6 @@ def importance_filter(image: Tensor, importance: Tensor, kernel_size: int) -> Te
         arguments = (out.numpy(), source(readable(image, dtype)), source(readable(importance, dtype)), kernel_size)
         share_rows(image, lambda *rows: _average(*arguments, *rows))
     return out.to(image.dtype)
-
-
-@importance_filter.register_fake
-def _(image: Tensor, importance: Tensor, kernel_size: int) -> Tensor:
-    return image.new_empty(image.shape)
 
 
 @compiled

@@ -1,6 +1,11 @@
-"""Per-pixel kernel convolution and its transpose."""
+"""Per-pixel kernel convolution."""
 
-from mcdenoise.ops._filters import kernel_operators
-from mcdenoise.ops._numba import _filter
+from torch import Tensor
 
-kernel_conv, kernel_conv_gradients, kernel_splat, kernel_splat_gradients = kernel_operators("numba", _filter)
+from mcdenoise.ops._numba.bilateral_filter import cross_bilateral_filter
+from mcdenoise.ops._window import Border
+
+
+def kernel_conv(image: Tensor, kernel: Tensor, border: Border) -> Tensor:
+    """See :func:`mcdenoise.ops.kernel_conv`."""
+    return cross_bilateral_filter(image, kernel, (), (), None, "none", border)

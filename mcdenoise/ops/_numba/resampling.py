@@ -11,10 +11,8 @@ from torch import Tensor
 
 from mcdenoise.ops._constants import CUBIC
 from mcdenoise.ops._numba._runtime import compiled, share_rows, source
-from mcdenoise.ops._operator import custom_op
 
 
-@custom_op("mcdenoise::resample", device_types="cpu", schema="(Tensor previous, Tensor motion) -> Tensor")
 def resample(previous: Tensor, motion: Tensor) -> Tensor:
     """See :func:`mcdenoise.ops.resample`."""
     dtype = torch.promote_types(previous.dtype, torch.float32)
@@ -24,11 +22,6 @@ def resample(previous: Tensor, motion: Tensor) -> Tensor:
         arguments = value.numpy(), old.numpy(), source(motion.to(dtype))
         share_rows(previous, lambda *rows: _resample(*arguments, *rows))
     return value.to(previous.dtype)
-
-
-@resample.register_fake
-def _(previous: Tensor, motion: Tensor) -> Tensor:
-    return previous.new_empty(previous.shape)
 
 
 @compiled
