@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -64,22 +63,13 @@ def test_a_damaged_file_is_written_again(twice: Callable[..., Any], folder: Path
             old.unlink()
 
 
-class Foreign:
-    """Whoever unpickles it makes a folder."""
-
-    def __init__(self, mark: Path) -> None:
-        self.mark = mark
-
-    def __reduce__(self) -> Any:
-        return os.mkdir, (str(self.mark),)
-
-
 @pytest.mark.skipif(os.name != "posix", reason="no owners and modes of folders")
 def test_a_folder_that_everybody_may_write_is_not_used(twice: Callable[..., Any], folder: Path, tmp_path: Path) -> None:
     assert hits(twice, 2.0) == 0
     (path,) = files(folder, ".nbi")
     path.parent.chmod(0o777)
-    path.write_bytes(pickle.dumps(Foreign(tmp_path / "opened")))
+    # Whoever unpickles it makes a folder.
+    path.write_bytes(f"cposix\nmkdir\n(V{tmp_path / 'opened'}\ntR.".encode())
     assert [hits(twice, 2.0) for _ in range(2)] == [0, 0]
     assert not (tmp_path / "opened").exists()
 

@@ -6,7 +6,6 @@ import functools
 import hashlib
 import math
 import os
-import pickle
 import secrets
 import stat
 from collections.abc import Callable
@@ -58,8 +57,7 @@ class _Cache(FunctionCache):
                 return
             try:
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-            except (EOFError, ValueError, pickle.PickleError):
-                # The index is damaged.
+            except Exception:  # the index may be damaged
                 self.flush()  # type: ignore[no-untyped-call]
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
