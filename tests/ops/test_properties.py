@@ -81,15 +81,6 @@ def test_a_filter_of_sum_one_stays_between_the_extremes(drawn: tuple[Tensor, Ten
     assert_between(ops.kernel_conv(image, kernel, border=border), image, roundings=60)
 
 
-@given(weighted(), st.sampled_from(BORDERS))
-def test_splatting_is_the_transpose_of_gathering(drawn: tuple[Tensor, Tensor], border: Any) -> None:
-    image, kernel = (tensor.double() for tensor in drawn)
-    other = torch.rand(image.shape, generator=torch.Generator().manual_seed(0)).double()
-    left = (ops.kernel_conv(image, kernel, border=border) * other).sum()
-    right = (image * ops.kernel_splat(other, kernel, border=border)).sum()
-    assert float((left - right).abs()) <= 1e-12 * float(left.abs() + right.abs())
-
-
 @given(weighted(), st.sampled_from(BORDERS), st.integers(0, 35), st.sampled_from([math.nan, math.inf]))
 def test_a_broken_pixel_reaches_its_window_and_no_further(
     drawn: tuple[Tensor, Tensor], border: Any, place: int, value: float
