@@ -15,7 +15,7 @@ from torch import Tensor
 from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
-from mcdenoise.folder import SequenceReport, denoise_sequence, make_folder
+from mcdenoise.folder import denoise_sequence, make_folder
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import display_codes
@@ -24,6 +24,7 @@ from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import render_sequence
+from mcdenoise.sequence_report import SequenceReport
 
 FRAMES = 16
 SIZE = (320, 180)

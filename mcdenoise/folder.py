@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from itertools import zip_longest
 from pathlib import Path
@@ -25,7 +25,8 @@ from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import FrameReport, Output, Skipping, Stage, parts_of, summarize
+from mcdenoise.models import FrameReport, Output, Skipping, parts_of
+from mcdenoise.sequence_report import SequenceReport
 
 # Largest fraction of pixels without a history, and smallest correlation of two images of the same place.
 _MOST, _ALIKE = 0.5, 0.9
@@ -43,85 +44,6 @@ class FrameError(InputError):
     def __init__(self, message: str, number: int) -> None:
         super().__init__(message)
         self.number = number
-
-
-@dataclass
-class SequenceReport:
-    """Report of denoising a sequence.
-
-    Args:
-        model: name of the model with its settings, or path of its weights.
-        reading: how the sequence stores its color.
-        picked: the model that was picked, and why; empty if it was named.
-        frames: report of each frame, by number; run times include waiting for the disk.
-        files: the written file of each frame, by number.
-        alike: frames that look like the previous one but have no history.
-        older: names of files of other frames that existed before and still exist.
-    """
-
-    model: str
-    reading: str
-    picked: str = ""
-    frames: dict[int, FrameReport] = field(default_factory=dict)
-    files: dict[int, Path] = field(default_factory=dict)
-    alike: list[int] = field(default_factory=list)
-    older: list[str] = field(default_factory=list)
-
-    @property
-    def milliseconds(self) -> dict[str, float]:
-        """Median run time of each stage over all frames but the first, which includes warming up."""
-        return _medians([report.milliseconds for report in self.frames.values()])
-
-    @property
-    def beside(self) -> dict[str, float]:
-        """Median run times of reading and writing, which overlap with denoising another frame."""
-        return _medians([report.beside for report in self.frames.values()])
-
-    @property
-    def tiles(self) -> str:
-        """How the image was divided into tiles for the network, and why."""
-        return next((report.tiles for report in self.frames.values()), "")
-
-    @property
-    def precision(self) -> str:
-        """The reason for the precision of the convolutions."""
-        return next((report.precision for report in self.frames.values()), "")
-
-    @property
-    def plan(self) -> list[dict[str, Any]]:
-        """For each stage, whether it was computed, how much of it was skipped, and why, see :func:`summarize`."""
-        read = Stage("read", 0.0, self.reading)
-        return summarize([[read, *report.stages.values()] for report in self.frames.values()])
-
-    @property
-    def warnings(self) -> list[str]:
-        """Probable mistakes in the input or output."""
-        found = []
-        # A shot may contain cuts, but not at every second frame.
-        if len(self.alike) * 4 > len(self.frames):
-            found.append(
-                f"history: in {len(self.alike)} of {len(self.frames)} frames most pixels find nothing in the frame "
-                "before, though the two look alike; check motion and cameras with `mcdenoise inspect`"
-            )
-        if doubts := [(number, done.repairs.doubt) for number, done in self.frames.items() if done.repairs.doubt]:
-            number, doubt = doubts[0]
-            found.append(f"{doubt} (frame {number}, and {len(doubts) - 1} others of {len(self.frames)})")
-        if repeated := [(number, done.repeats) for number, done in self.frames.items() if done.repeats]:
-            number, advice = repeated[0]
-            found.append(f"{advice} (frame {number}, and {len(repeated) - 1} others of {len(self.frames)})")
-        # These files may be other frames of the same shot and hours of work: only the user may remove them.
-        if self.older:
-            names = ", ".join(self.older if len(self.older) <= 4 else [self.older[0], "...", self.older[-1]])
-            found.append(
-                f"output: {len(self.older)} {'file' if len(self.older) == 1 else 'files'} of an earlier run ({names}) "
-                "remain beside the result, and denoise.json does not list them; remove what is not wanted"
-            )
-        return found
-
-    @property
-    def replaced_pixels(self) -> int:
-        """Pixels of the noisy color, over all frames, that were NaN, infinite, negative or above 1e16."""
-        return sum(report.replaced_pixels for report in self.frames.values())
 
 
 def denoise_sequence(
@@ -232,30 +154,12 @@ def write_frames(
             written.
         InputError: a file cannot be written, or memory is insufficient.
     """
-
-    def write(number: int, output: Output, done: FrameReport) -> None:
-        start = time.perf_counter()
-        if number not in unwritten:
-            report.files[number] = sequence.write(
-                out,
-                number,
-                _pixels(output.image),
-                alpha=None if output.alpha is None else _pixels(output.alpha),
-                lights={name: _pixels(layer) for name, layer in output.layers.items()},
-                output_layer=output_layer,
-                full_float=full_float,
-            )
-            done.beside["write"] = _since(start)
-        if on_file is not None:
-            start = time.perf_counter()
-            on_file(number, output.image)
-            done.beside["show"] = _since(start)
-
-    def step(frame: Frame) -> Output:
-        return denoiser.output(frame, stages=on_output is not None)
-
+    write = partial(
+        _write, sequence, out, report, unwritten, output_layer=output_layer, full_float=full_float, on_file=on_file
+    )
+    step = partial(denoiser.output, stages=on_output is not None)
     with ThreadPoolExecutor(1) as writer:
-        writing: Future[None] | None = None
+        writing: Future[None] = writer.submit(lambda: None)
         seen: Tensor | None = None
         for number, frame, times in _read_frames(sequence, denoiser, reference=references, of=of, on_read=on_read):
             output = _denoised(step, sequence, number, denoiser, frame, times)
@@ -263,13 +167,11 @@ def write_frames(
                 on_output(frame, output)
                 output = output._replace(stages={})
             seen, before = _thumbnail(frame), seen
-            repeats = denoiser.report.repeats
-            if not repeats and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
+            if not denoiser.report.repeats and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
                 report.alike.append(number)
             del frame
             start = time.perf_counter()
-            if writing is not None:
-                writing.result()
+            writing.result()
             report.frames[number] = denoiser.report
             writing = writer.submit(write, number, output, denoiser.report)
             del output
@@ -277,8 +179,38 @@ def write_frames(
                 writing.result()
             denoiser.report.milliseconds["waiting"] += _since(start)
             on_frame()
-        if writing is not None:
-            writing.result()
+        writing.result()
+
+
+def _write(
+    sequence: Sequence,
+    out: Path,
+    report: SequenceReport,
+    unwritten: Collection[int],
+    number: int,
+    output: Output,
+    done: FrameReport,
+    *,
+    output_layer: str | None,
+    full_float: bool,
+    on_file: Callable[[int, Tensor], None] | None,
+) -> None:
+    start = time.perf_counter()
+    if number not in unwritten:
+        report.files[number] = sequence.write(
+            out,
+            number,
+            _pixels(output.image),
+            alpha=None if output.alpha is None else _pixels(output.alpha),
+            lights={name: _pixels(layer) for name, layer in output.layers.items()},
+            output_layer=output_layer,
+            full_float=full_float,
+        )
+        done.beside["write"] = _since(start)
+    if on_file is not None:
+        start = time.perf_counter()
+        on_file(number, output.image)
+        done.beside["show"] = _since(start)
 
 
 def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: SequenceReport) -> None:
@@ -329,7 +261,7 @@ def _read_frames(
     """Read each frame, and the next one ahead if memory allows. Resets the denoiser."""
     if denoiser.model is None:
         denoiser.reset(frames=of or len(sequence))
-        denoiser.pick(sequence.telling_frame())
+        denoiser.pick(sequence.first_valid_frame())
     needs = denoiser.model.needs
     wanted = needs.buffers | needs.uses
     buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
@@ -415,13 +347,6 @@ def _alike(one: Tensor, other: Tensor | None) -> bool:
 
 def _since(start: float) -> float:
     return (time.perf_counter() - start) * 1e3
-
-
-def _medians(frames: list[dict[str, float]]) -> dict[str, float]:
-    frames = frames[1:] or frames
-    # A model may skip a stage in some frames.
-    stages = dict.fromkeys(stage for times in frames for stage in times)
-    return {stage: sorted(times.get(stage, 0.0) for times in frames)[len(frames) // 2] for stage in stages}
 
 
 def make_folder(out: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError, did_you_mean, level_of_caller
-from mcdenoise.light import LARGEST_RADIANCE, Repairs, is_valid, judged, repair
+from mcdenoise.light import LARGEST_RADIANCE, Repairs, is_valid, repair, repairs_from
 
 # Half floats and a renderer's own arithmetic may exceed a range by this.
 _ROUNDING = 1e-2
@@ -387,7 +387,7 @@ class Frame:
         repairs = Repairs()
         if not all(map(is_valid, (self.color, *self.layers.values()))):
             repaired = repair(self.color, self.layers, reads=True)
-            repairs = judged(repaired.numbers.tolist(), list(self.layers))
+            repairs = repairs_from(repaired.numbers.tolist(), list(self.layers))
             changes |= {"color": repaired.color, "layers": repaired.layers}
         for name, value in self.items():
             if name != "color":
@@ -667,7 +667,7 @@ def _repaired(frame: Frame) -> Unread:
             changes[name] = value.clamp(spec.low, spec.high)
 
     def judge(read: Sequence[float]) -> Repairs:
-        repairs, found = judged(read[:of_light], layers), iter(read[of_light:])
+        repairs, found = repairs_from(read[:of_light], layers), iter(read[of_light:])
         for name in names:
             low, high, illegal, above = (next(found) for _ in range(4))
             if illegal:

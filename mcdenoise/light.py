@@ -73,7 +73,7 @@ class Repaired(NamedTuple):
     Args:
         color: ``(B, C, H, W)``.
         layers: ``(B, C, H, W)`` each.
-        numbers: ``(N,)`` for :func:`judged`.
+        numbers: ``(N,)`` for :func:`repairs_from`.
     """
 
     color: Tensor
@@ -112,7 +112,7 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
     if is_valid(color):
         return color, 0
     repaired = repair(color, {}, reads=True)
-    return repaired.color, judged(repaired.numbers.tolist(), ()).pixels
+    return repaired.color, repairs_from(repaired.numbers.tolist(), ()).pixels
 
 
 def is_valid(image: Tensor) -> bool:
@@ -216,7 +216,7 @@ def filled(image: Tensor, known: Tensor) -> Tensor:
     return torch.where(known, image, coarse.to(image.dtype))
 
 
-def judged(numbers: Sequence[float], layers: Sequence[str]) -> Repairs:
+def repairs_from(numbers: Sequence[float], layers: Sequence[str]) -> Repairs:
     """What was invalid, from the numbers of :func:`repair`.
 
     Raises:

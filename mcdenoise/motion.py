@@ -109,7 +109,7 @@ def read_motion(
     Cameras determine it best, see :func:`match_cameras`; otherwise the frames, see :func:`match_motion`.
     """
     by_cameras = match_cameras(seen_elsewhere, given)
-    chosen, told = (by_cameras, True) if by_cameras else match_motion(pairs, given)
+    chosen, conclusive = (by_cameras, True) if by_cameras else match_motion(pairs, given)
     if chosen is None:
         warning = (
             "'motion': does not lead to what looks alike in the frame before, whichever way it is read; it is not used"
@@ -118,7 +118,7 @@ def read_motion(
     warnings = []
     if chosen[:2] != given[:2]:
         warnings = [f"'motion': read as {chosen.words}, since only so frames match the ones before them"]
-    return chosen, f"{chosen.words}{', as neighbouring frames match' if told else ''}", warnings
+    return chosen, f"{chosen.words}{', as neighbouring frames match' if conclusive else ''}", warnings
 
 
 def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention | None, bool]:

@@ -38,14 +38,14 @@ def has_centred_features(frame: Frame) -> bool:
     # A zero normal: nothing was hit.
     if float(((squares < _UNIT) & (squares > 0)).float().mean()) > _MOST_MEANS:
         return False
-    even = told = 0
+    even = compared = 0
     for inverse in ((near := frame.depth.detach().reciprocal()), near.mT):
         a, b, c = inverse[..., :-2], inverse[..., 1:-1], inverse[..., 2:]
         slope = (a - c).abs()
         known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
-        told += int(known.sum())
+        compared += int(known.sum())
         even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > told / 4
+    return even > compared / 4
 
 
 def has_scattered_features(frame: Frame) -> bool:

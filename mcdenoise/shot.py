@@ -232,10 +232,10 @@ def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, st
     """The name of the model that suits a shot, and the reason in words, see :func:`suitable_model`.
 
     Args:
-        sequence: the shot; see :meth:`mcdenoise.data.Sequence.telling_frame`.
+        sequence: the shot; see :meth:`mcdenoise.data.Sequence.first_valid_frame`.
         cascade: whether a cascade is required.
     """
-    return suitable_model(sequence.telling_frame(), still=len(sequence) == 1, cascade=cascade)
+    return suitable_model(sequence.first_valid_frame(), still=len(sequence) == 1, cascade=cascade)
 
 
 def check_threads(threads: int) -> None:

@@ -28,6 +28,7 @@ LIBRARY = SIGNAL | {
     "data",
     "scenes",
     "denoiser",
+    "sequence_report",
 }
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
 TOOLS = REPORTS | {"budget", "demo", "export", "film", "preview", "suite", "train"}
@@ -60,6 +61,7 @@ ALLOWED: dict[str, set[str]] = {
     "methods": SIGNAL | {"models", "denoiser"},
     # These modules are for scripts of a renderer: nothing of the package imports them.
     "integrations": SIGNAL | {"models", "denoiser"},
+    "sequence_report": {"models"},
     "folder": LIBRARY,
     "shot": LIBRARY | {"budget", "methods", "preview"},
     "check": LIBRARY | {"methods", "own"},

@@ -7,7 +7,7 @@ from torch import Tensor
 from mcdenoise import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.light import LARGEST_RADIANCE, Repairs, filled, judged, repair, replace_invalid
+from mcdenoise.light import LARGEST_RADIANCE, Repairs, filled, repair, repairs_from, replace_invalid
 
 NAN, INF = torch.nan, torch.inf
 
@@ -25,7 +25,7 @@ def signed(mean: float, deviation: float, size: int = 96) -> Tensor:
 
 
 def repairs_of(color: Tensor) -> Repairs:
-    return judged(repair(color, {}, reads=True).numbers.tolist(), ())
+    return repairs_from(repair(color, {}, reads=True).numbers.tolist(), ())
 
 
 @pytest.mark.parametrize("bad", [NAN, -INF])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from mcdenoise.data.files import atomic_path
+from mcdenoise.data.images import pending_error
 from mcdenoise.errors import InputError
 
 Picture = NDArray[np.uint8]
@@ -49,9 +49,9 @@ def read_png(path: Path) -> Picture:
     """
     file = oiio.ImageInput.open(str(path))
     if file is None:
-        raise InputError(f"{path}: expected a PNG, found: {_reason(oiio)}")
+        raise InputError(f"{path}: expected a PNG, found: {pending_error(oiio)}")
     pixels = file.read_image(0, 0, 0, 3, "uint8")
-    reason = _reason(file)
+    reason = pending_error(file)
     file.close()
     if pixels is None or reason or file.spec().nchannels != 3:
         raise InputError(f"{path}: expected a PNG of 3 channels, found: {reason or file.spec().nchannels}")
@@ -67,18 +67,13 @@ def _write(path: Path, picture: Picture) -> str:
     # Not ImageBuf, which leaves an entry per file in OpenImageIO's cache and fragments the heap.
     file = oiio.ImageOutput.create("png")
     if file is None or not file.open(str(path), spec):
-        return _reason(file or oiio)
+        return pending_error(file or oiio)
     written = file.write_image(np.ascontiguousarray(picture))
-    reason = _reason(file)
+    reason = pending_error(file)
     if not file.close() or not written:
         return reason or "writing failed"
     # OpenImageIO does not report a full disk, so check the end of the file.
     return "" if path.read_bytes().endswith(_END) else "incomplete"
-
-
-def _reason(source: Any) -> str:
-    """OpenImageIO's pending error in one line."""
-    return str(source.geterror()).strip().split("\n")[0]
 
 
 def caption(picture: Picture, text: str) -> Picture:

@@ -99,10 +99,11 @@ class Sequence:
         referenced = [number for number in self.reference_numbers if number in chosen]
         return replace(self, numbers=list(numbers), reference_numbers=referenced)
 
-    def telling_frame(self) -> Frame | None:
+    def first_valid_frame(self) -> Frame | None:
         """The first frame without damage, by which to choose a model; ``None`` for files of a renderer.
 
-        Features of those do not tell: with one sample they are those of the pixel centre, whatever the filter is.
+        With one sample, features of those are from the pixel centre whatever the filter is, so that they decide
+        nothing.
         """
         for number in self.numbers if self.layout != "files" else ():
             # A damaged frame is reported when it is denoised.

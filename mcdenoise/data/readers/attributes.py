@@ -93,42 +93,42 @@ def readable(source: Path, copy: Path) -> Iterator[tuple[Path, dict[tuple[int, b
     Yields:
         ``source`` itself and nothing, or ``copy`` and the original records by part and name.
     """
-    strange: dict[tuple[int, bytes], bytes] = {}
+    unreadable: dict[tuple[int, bytes], bytes] = {}
     with source.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        found = [each for each in records(content) if _is_strange(each, content)]
+        found = [each for each in records(content) if _is_unreadable(each, content)]
         if found:
             pixels = bytearray(content)
             for part, name, _, start, _, end in found:
                 # A name of the format must not have a text.
                 name = b"~" + name[1:] if name in _OF_FORMAT else name
-                strange[part, name] = content[start:end]
+                unreadable[part, name] = content[start:end]
                 rest = end - start - len(name) - len(b"\0string\0....")
                 if rest < 0:
                     raise ValueError("damaged header")
                 text = name + b"\0string\0" + rest.to_bytes(4, "little") + b"." * rest
                 pixels[start:end] = text
-    if not strange:
-        yield source, strange
+    if not unreadable:
+        yield source, unreadable
         return
     try:
         copy.write_bytes(pixels)
         del pixels
-        yield copy, strange
+        yield copy, unreadable
     finally:
         with suppress(OSError):
             os.unlink(copy)
 
 
-def put_back(target: Path, strange: dict[tuple[int, bytes], bytes]) -> None:
+def put_back(target: Path, unreadable: dict[tuple[int, bytes], bytes]) -> None:
     """Replace placeholder records by the original ones."""
     with target.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
         for part, name, _, start, _, end in list(records(content)):
-            record = strange.get((part, name))
+            record = unreadable.get((part, name))
             if record is not None and len(record) == end - start:
                 content[start:end] = record
 
 
-def _is_strange(record: Record, content: mmap.mmap) -> bool:
+def _is_unreadable(record: Record, content: mmap.mmap) -> bool:
     name, kind, value = record.name, record.kind, content[record.value : record.end]
     if (
         kind not in _COPIED

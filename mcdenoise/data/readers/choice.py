@@ -72,18 +72,18 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     """
     choice = Choice()
     candidates: dict[str, list[tuple[int, Layer]]] = {buffer: [] for buffer in NAMES}
-    strangers: list[Layer] = []
+    unnamed: list[Layer] = []
     for layer in layers:
         found = recognise(layer)
         # A single channel is a color only if there is no other.
         if found is not None and fits(found[0], layer) and not (found[0] == "color" and len(layer.channels) == 1):
             candidates[found[0]].append((found[1], layer))
         else:
-            strangers.append(layer)
+            unnamed.append(layer)
     if not candidates["color"]:
         # The name of a shot may be a letter, as in a_0001.exr or [n].hdr, which is a buffer's name elsewhere.
         for ranked in candidates.values():
-            strangers += [layer for _, layer in ranked if _is_letter(layer)]
+            unnamed += [layer for _, layer in ranked if _is_letter(layer)]
             ranked[:] = [(rank, layer) for rank, layer in ranked if not _is_letter(layer)]
     for buffer, text in mapping.items():
         if text:
@@ -92,13 +92,13 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     if not candidates["color"] and "color" not in mapping and len(references := candidates["reference"]) == 1:
         # A single layer is an ordinary picture.
         candidates["color"], candidates["reference"] = references, []
-    color = choice.layers.get("color") or _color(where, candidates["color"], strangers, layers)
+    color = choice.layers.get("color") or _color(where, candidates["color"], unnamed, layers)
     choice.layers["color"] = color
     # Positions may tell which depth is right.
     for buffer in sorted(NAMES, key=lambda name: name == "depth"):
         if buffer not in choice.layers and buffer not in mapping:
             _choose_best(choice, buffer, candidates[buffer], read)
-    own = [layer for layer in strangers if not color.family or layer.family == color.family]
+    own = [layer for layer in unnamed if not color.family or layer.family == color.family]
     _by_values(choice, own, mapping, read)
     # Both a denoised and a noisy layer exist: read the noisy one, and write the result to the denoised one.
     finished = [layer for rank, layer in candidates["color"] if layer.family == color.family and rank == 1]
@@ -113,8 +113,8 @@ def choose(where: str, layers: Sequence[Layer], mapping: Mapping[str, str], read
     choice.written += choice.converted
     used = {*choice.layers.values(), *choice.written}
     known = [layer for own in candidates.values() for _, layer in own]
-    choice.unused = [layer for layer in [*known, *filter(is_about_a_buffer, strangers)] if layer not in used]
-    choice.unknown = [layer for layer in strangers if layer not in used and layer not in choice.unused]
+    choice.unused = [layer for layer in [*known, *filter(is_about_a_buffer, unnamed)] if layer not in used]
+    choice.unknown = [layer for layer in unnamed if layer not in used and layer not in choice.unused]
     return choice
 
 
@@ -156,12 +156,12 @@ def _mapped(where: str, layers: Sequence[Layer], buffer: str, text: str) -> Laye
 
 
 def _color(
-    where: str, candidates: Sequence[tuple[int, Layer]], strangers: Sequence[Layer], layers: Sequence[Layer]
+    where: str, candidates: Sequence[tuple[int, Layer]], unnamed: Sequence[Layer], layers: Sequence[Layer]
 ) -> Layer:
     if not candidates:
         # A single picture of unknown name is the noisy color.
-        pictures = [layer for layer in strangers if layer.is_color]
-        single = [layer for layer in strangers if layer.components in (("",), ("v",)) or is_luminance(layer)]
+        pictures = [layer for layer in unnamed if layer.is_color]
+        single = [layer for layer in unnamed if layer.components in (("",), ("v",)) or is_luminance(layer)]
         for own in (pictures, [layer for layer in single if is_luminance(layer)], single):
             if len(own) == 1 and (own is pictures or not pictures):
                 return own[0]
@@ -232,9 +232,9 @@ def _rank_by_points(choice: Choice, buffer: str, image: Image, read: Read) -> in
     return next((rank for rank, each in enumerate(off) if each < _SAME_DEPTH), 2)
 
 
-def _twins(color: Layer, strangers: Sequence[Layer], read: Read) -> list[Layer]:
+def _twins(color: Layer, unnamed: Sequence[Layer], read: Read) -> list[Layer]:
     """Layers equal to the color: Mitsuba writes the color of a nested integrator twice."""
-    others = [layer for layer in strangers if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
+    others = [layer for layer in unnamed if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
     if not others:
         return []
     # Compare a few rows first, since every read decompresses all layers of these rows.
@@ -257,9 +257,9 @@ def _equal(one: Image, other: Image) -> bool:
     return np.array_equal(one[..., :3], other[..., :3], equal_nan=True)
 
 
-def _conversions(color: Layer, strangers: Sequence[Layer], read: Read) -> dict[Layer, Array]:
+def _conversions(color: Layer, unnamed: Sequence[Layer], read: Read) -> dict[Layer, Array]:
     """Layers with the color as XYZ or luminance, as Mitsuba's films write it beside the RGB of a nested integrator."""
-    own = [layer for layer in strangers if (layer.group, layer.part) == (color.group, color.part)]
+    own = [layer for layer in unnamed if (layer.group, layer.part) == (color.group, color.part)]
     matrices = {
         layer: _TO_XYZ if len(layer.channels) > 1 else _TO_XYZ[1:2]
         for layer in own
@@ -276,13 +276,13 @@ def _conversions(color: Layer, strangers: Sequence[Layer], read: Read) -> dict[L
     return {layer: matrices[layer] for layer, each in near.items() if light.any() and each.mean() > 1 - _SAME_COLOR}
 
 
-def _by_values(choice: Choice, strangers: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
+def _by_values(choice: Choice, unnamed: Sequence[Layer], mapping: Mapping[str, str], read: Read) -> None:
     """Recognise layers with unknown names, such as Mitsuba's: depths end in T, normals have unit length."""
-    depths = [layer for layer in strangers if layer.components == ("t",)]
+    depths = [layer for layer in unnamed if layer.components == ("t",)]
     directions: list[Layer] = []
     points: list[Layer] = []
     named_already = {"normal", "position"} <= {*choice.layers, *mapping}
-    triples = [] if named_already else [each for each in strangers if each.components == ("x", "y", "z")]
+    triples = [] if named_already else [each for each in unnamed if each.components == ("x", "y", "z")]
     for layer, vectors in read(triples, _ALL).items():
         if is_direction(vectors):
             directions.append(layer)

@@ -62,7 +62,7 @@ class Split:
             for name, own in self.parts.items()
         }
 
-    def without_strangers(self, images: Mapping[Layer, Image], color: Image) -> Split:
+    def without_absent_light(self, images: Mapping[Layer, Image], color: Image) -> Split:
         """The same without lights that are not in the color, such as the sky of a transparent film, by their values."""
         lights = {f"{name} {i}": each for name, own in self.parts.items() for i, each in enumerate(own)}
         pixels = {name: light.radiance(images)[:, ::_STEP].reshape(-1, 3) for name, light in lights.items()}
@@ -88,17 +88,17 @@ class Split:
         return found
 
 
-def find_splits(layers: Sequence[Layer], color: Layer, asked: Mapping[str, Layer]) -> list[Split]:
+def find_splits(layers: Sequence[Layer], color: Layer, mapped: Mapping[str, Layer]) -> list[Split]:
     """Find candidates for the parts of a color by names of layers; only their values tell whether they are.
 
     Args:
         layers: all layers of a frame.
         color: layer of the color.
-        asked: layers that the user has mapped to buffers; diffuse and specular among them replace the search.
+        mapped: layers that the user has mapped to buffers; diffuse and specular among them replace the search.
     """
-    if {DIFFUSE, SPECULAR} <= asked.keys():
-        chosen = {name: (Light((asked[name],)),) for name in (DIFFUSE, SPECULAR, EMISSION) if name in asked}
-        return [Split(chosen, asked.get(SPECULAR_ALBEDO))]
+    if {DIFFUSE, SPECULAR} <= mapped.keys():
+        chosen = {name: (Light((mapped[name],)),) for name in (DIFFUSE, SPECULAR, EMISSION) if name in mapped}
+        return [Split(chosen, mapped.get(SPECULAR_ALBEDO))]
     own = [each for each in layers if each != color and each.is_color]
     own = [each for each in own if each.anonymous or each.family == color.family]
     titles: dict[str, Layer] = {}

@@ -250,7 +250,7 @@ def examine_parts(
         far = split.difference(sums, color)
         if not is_same(far):
             refused.append((split, far, _light(*sums.values()) / (_light(color) or 1)))
-            split = split.without_strangers(pixels, color)
+            split = split.without_absent_light(pixels, color)
             sums = split.sums(pixels)
             if not is_same(split.difference(sums, color)):
                 continue

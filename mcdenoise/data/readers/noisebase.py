@@ -163,7 +163,7 @@ class _Arrays:
 
 
 @dataclass
-class NoisebaseFiles(Source):
+class _NoisebaseFiles(Source):
     """Frames of one sequence; made by :func:`open_noisebase`.
 
     Args:
@@ -189,18 +189,15 @@ class NoisebaseFiles(Source):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
         height, width, _ = self.shapes["color"][-3:]
         return height, width
 
     @property
     def folders(self) -> set[Path]:
-        """The folders of the files."""
         return {path.parent for path in self.files.values()}
 
     @property
     def buffers(self) -> frozenset[str]:
-        """Names of the buffers that every frame has."""
         present = {"color"} | ({"variance", "samples"} if self.samples > 1 else set())
         present |= {own for own, name in _SOURCES.items() if name in self.shapes}
         if {"position", "motion"} <= self.shapes.keys():
@@ -211,20 +208,17 @@ class NoisebaseFiles(Source):
 
     @property
     def reference_numbers(self) -> list[int]:
-        """Frames in use that have a reference: all or none."""
         return self.numbers if "reference" in self.shapes else []
 
     @property
     def unused(self) -> list[str]:
-        """Arrays that are not used."""
         return sorted(self.shapes.keys() - _IMAGES.keys() - _NUMBERS.keys() - _REDUNDANT)
 
     def frame_files(self, number: int) -> list[Path]:
-        """The zip of one frame, or of all frames."""
         return [self.files[number]]
 
     def metadata(self, number: int) -> Metadata:
-        """Empty, because the arrays have no attributes."""
+        # The arrays have no attributes.
         return {}
 
     def opened(self, number: int) -> AbstractContextManager[_Arrays]:
@@ -232,7 +226,6 @@ class NoisebaseFiles(Source):
         return _opened(self.files[number], number if self.has_frames else None)
 
     def reference(self, number: int) -> Tensor:
-        """Read the reference of one frame."""
         with self.opened(number) as arrays:
             return _tensor(arrays.mean("reference"))
 
@@ -283,9 +276,7 @@ def find_zips(given: Sequence[Path]) -> list[Path]:
     return list(given) if all(path.suffix == SUFFIX for path in given) else []
 
 
-def open_noisebase(
-    paths: Sequence[Path], choose_numbers: Callable[[list[int]], list[int]], *, where: str
-) -> NoisebaseFiles:
+def open_noisebase(paths: Sequence[Path], choose_numbers: Callable[[list[int]], list[int]], *, where: str) -> Source:
     """Check zips, and whether the first frame's positions are projected to their pixels.
 
     Args:
@@ -298,7 +289,7 @@ def open_noisebase(
             one.
     """
     first = _shapes(paths[0])
-    shot = NoisebaseFiles(numbers=[], files={}, shapes=first)
+    shot = _NoisebaseFiles(numbers=[], files={}, shapes=first)
     if shot.has_frames:
         if len(paths) > 1:
             raise InputError(f"{where}: expected one sequence, found {len(paths)}; give one of its files")
@@ -323,7 +314,7 @@ def open_noisebase(
     return shot
 
 
-def _find_view(shot: NoisebaseFiles) -> None:
+def _find_view(shot: _NoisebaseFiles) -> None:
     """Determine the full image of the matrices from the positions of the first frame."""
     mean = f"mean of {shot.samples} samples"
     words = {"color": f"radiance, {mean}", "variance": f"variance of the {mean}", "reference": "radiance"}
@@ -355,10 +346,10 @@ def _find_view(shot: NoisebaseFiles) -> None:
 
 def _seen(means: Mapping[str, Array]) -> Mask:
     """The pixels that hit something: those with a normal or a reflectance in any sample."""
-    told = [means[name] for name in ("normal", "diffuse") if name in means]
+    features = [means[name] for name in ("normal", "diffuse") if name in means]
     seen: Mask = np.all(np.isfinite(means["position"]), axis=0)
-    if told:
-        seen &= (np.concatenate(told) != 0).any(0)
+    if features:
+        seen &= (np.concatenate(features) != 0).any(0)
     return seen
 
 

@@ -305,9 +305,9 @@ def _splits(layers: Sequence[Layer], choice: Choice, mapping: Mapping[str, str])
     """Candidates for diffuse and specular light, unless the user has excluded them."""
     if "" in {mapping.get(DIFFUSE), mapping.get(SPECULAR)}:
         return []
-    asked = {name: choice.layers[name] for name in mapping if name in choice.layers}
-    if {DIFFUSE, SPECULAR} <= asked.keys():
+    mapped = {name: choice.layers[name] for name in mapping if name in choice.layers}
+    if {DIFFUSE, SPECULAR} <= mapped.keys():
         # These layers are read as parts only.
-        for name in {DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO} & asked.keys():
+        for name in {DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO} & mapped.keys():
             del choice.layers[name]
-    return find_splits(layers, choice.layers["color"], asked)
+    return find_splits(layers, choice.layers["color"], mapped)

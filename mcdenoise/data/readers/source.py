@@ -1,4 +1,4 @@
-"""What every layout of files tells and does."""
+"""The interface of every layout of files."""
 
 from __future__ import annotations
 

@@ -90,8 +90,8 @@ def albedo_included(color: Image, albedo: Image) -> Albedo:
         return Albedo(None, float("nan"), float("inf"))
     slope = float(sum(w * value for w, (value, _) in zip(weights, found, strict=True) if w) / weights.sum())
     error = float(weights.sum() ** -0.5)
-    told = abs(slope - _THRESHOLD) > _SIGMAS * error and error < _LARGEST_ERROR
-    included = slope > _THRESHOLD if told else None
+    significant = abs(slope - _THRESHOLD) > _SIGMAS * error and error < _LARGEST_ERROR
+    included = slope > _THRESHOLD if significant else None
     if included is False and not _has_other_edges(albedo, color, usable):
         included = None
     return Albedo(included, slope, error)
@@ -173,8 +173,8 @@ def _blocks(image: Image | Array | Mask) -> Array:
 
 def _jackknife(stripes: Array) -> tuple[float, float]:
     total = stripes.sum(0)
-    told = np.count_nonzero(stripes[:, 1])
-    if told < 8 or not total[1] > 0:
+    informative = np.count_nonzero(stripes[:, 1])
+    if informative < 8 or not total[1] > 0:
         return 0.0, float("inf")
     left_out = (total[0] - stripes[:, 0]) / np.maximum(total[1] - stripes[:, 1], 1e-30)
     n = len(stripes)
@@ -195,13 +195,13 @@ def read_radiance(
     included = None if reference is None else albedo_included_as_in(reference, color, albedo)
     why = "only so it is as bright as its reference"
     if included is None:
-        told = albedo_included(color, albedo)
-        included = told.included
-        why = f"1 % of albedo makes {told.elasticity:.2f} +- {told.error:.2f} % of light"
+        measured = albedo_included(color, albedo)
+        included = measured.included
+        why = f"1 % of albedo makes {measured.elasticity:.2f} +- {measured.error:.2f} % of light"
         if included is None:
             # Without any texture the values cannot tell, which is fine; with a contradicting texture the answer is
             # doubtful.
-            doubtful = told.elasticity + _SIGMAS * told.error < 2 / 3
+            doubtful = measured.elasticity + _SIGMAS * measured.error < 2 / 3
             warning = (
                 "'color': taken as ordinary radiance; its values do not tell whether it was divided by the albedo. If "
                 "it was, say --color-without-albedo"
