@@ -30,7 +30,7 @@ from mcdenoise.shot import ShotSettings
 from mcdenoise.train import TrainConfig
 
 RGB = ["R", "G", "B"]
-POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops", "manifest", "recipes"}
+POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops", "manifest"}
 
 
 @pytest.fixture(autouse=True)

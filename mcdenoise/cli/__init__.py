@@ -34,7 +34,6 @@ COMMANDS = {
     "render": "Render a Mitsuba 3 scene along a camera path to a noisy sequence with references.",
     "generate": "Render random scenes for training.",
     "train": "Train a model on sequences with references.",
-    "sweep": "Train the runs of recipes with several seeds, by many processes or machines.",
     "evaluate": "Compare a folder of denoised images with references.",
     "benchmark": "Measure error and run time of models and other denoisers.",
     "report": "Write the web page and the plots of a finished benchmark.",

@@ -109,25 +109,24 @@ def options_of(command: str) -> set[str]:
     return (inner | hints.keys()) - grouped.keys() - {"out", "return"}
 
 
-def make_data(recipe: Recipe, data: Path, ray: str | None = None) -> tuple[list[Path], list[Path]]:
+def make_data(recipe: Recipe, data: Path) -> tuple[list[Path], list[Path]]:
     """Folders to train on and to validate on, rendered where they are not there yet.
 
     Args:
         recipe: says what is rendered.
         data: folder of the sequences of all recipes.
-        ray: address of a Ray cluster that renders them.
 
     Raises:
         InputError: they cannot be rendered.
     """
     # All are parsed before the first is rendered.
-    ready = [(each, _generator(each, data, ray)) for each in (*recipe.data, *recipe.validation)]
+    ready = [(each, _generator(each, data)) for each in (*recipe.data, *recipe.validation)]
     made = [each.make(data, generate) for each, generate in ready]
     training, validation = made[: len(recipe.data)], made[len(recipe.data) :]
     return [path for each in training for path in each], [path for each in validation for path in each]
 
 
-def _generator(rendering: Rendering, data: Path, ray: str | None) -> Callable[[], None]:
+def _generator(rendering: Rendering, data: Path) -> Callable[[], None]:
     """`mcdenoise generate` with the options of a table, ready to be called."""
     arguments = ["--out", str(rendering.folder(data))]
     for key, value in rendering.options.items():
@@ -136,7 +135,6 @@ def _generator(rendering: Rendering, data: Path, ray: str | None) -> Callable[[]
             arguments.append(f"--{name}" if value else f"--no-{name}")
         else:
             arguments += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
-    arguments += [] if ray is None else ["--ray", ray]
     with naming(rendering.where):
         command = parse("generate", arguments)
 

@@ -1,6 +1,6 @@
 """Engines run tasks in other processes: those of this machine, or the workers of a Ray cluster.
 
-Films, rendering and training sweeps hand their tasks to an engine; :func:`run_tasks` retries the tasks of lost workers.
+Films and rendering hand their tasks to an engine; :func:`run_tasks` retries the tasks of lost workers.
 """
 
 from mcdenoise.engines.cluster import RayEngine

@@ -141,13 +141,12 @@ class Recipe:
     credits: str
 
     @staticmethod
-    def read(path: Path, options: Collection[str], seed: int | None = None) -> Recipe:
+    def read(path: Path, options: Collection[str]) -> Recipe:
         """Read a recipe, and check that its names exist.
 
         Args:
             path: the file.
             options: valid keys of a data table.
-            seed: seed of the training, in place of that of the recipe.
 
         Raises:
             InputError: the file cannot be read, a key is unknown, or a value is invalid.
@@ -160,9 +159,9 @@ class Recipe:
             raise InputError(f"{path}: expected at least one table [[data]] to render and train on, found none")
         rendered = [[(r.sha256, r.clean) for r in each] for each in made.values()]
         runs = []
-        for where, own in _run_tables(path, content, kinds, seed):
+        for where, own in _run_tables(path, content, kinds):
             name, expected = own.pop("name", ""), _expected(where, own.pop("expected", {}))
-            settings = common | own | ({} if seed is None else {"seed": seed})
+            settings = common | own
             sha256 = _digest([settings or None, *rendered])
             config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
             with naming(where):
@@ -191,9 +190,7 @@ class Recipe:
         return [run for run in self.runs if not names or run.name in names]
 
 
-def _run_tables(
-    path: Path, content: dict[str, Any], kinds: Mapping[str, type], seed: int | None
-) -> list[tuple[str, dict[str, Any]]]:
+def _run_tables(path: Path, content: dict[str, Any], kinds: Mapping[str, type]) -> list[tuple[str, dict[str, Any]]]:
     """The location of each run in the recipe, and its settings that differ from the common ones."""
     tables = content.get("run", [])
     if not isinstance(tables, list):
@@ -209,7 +206,6 @@ def _run_tables(
         name, seeds = own.get("name", ""), own.pop("seeds", None)
         if seeds is not None and not (seeds and all(type(seed) is int for seed in seeds)):
             raise InputError(f"{where}: seeds: expected a list of whole numbers, found {seeds}")
-        seeds = None if seed is not None else seeds
         every = [own] if seeds is None else [{**own, "name": f"{name}-{each}", "seed": each} for each in seeds]
         if not _NAME.fullmatch(name):
             raise InputError(f"{where}: name: expected letters, digits, '+', '-' and '_', found '{name}'")

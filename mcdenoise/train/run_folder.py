@@ -96,13 +96,6 @@ class RunFolder:
             file.write(content.getbuffer())
             file.write(_sealed(content.getbuffer()))
 
-    def checkpointed(self) -> int:
-        """When the checkpoint was written, in nanoseconds since 1970; 0 without one."""
-        try:
-            return self._checkpoint.stat().st_mtime_ns
-        except OSError:
-            return 0
-
     def load(self, *parts: Any) -> tuple[int, Provenance]:
         """Restore the state from the checkpoint; return zero steps if there is none.
 

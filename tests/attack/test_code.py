@@ -93,7 +93,7 @@ def test_a_recipe_and_a_manifest_name_no_code(
 ) -> None:
     (here / "recipe.toml").write_text(f'[train]\n{key} = "{model}"\nsteps = 1\n[[data]]\nseeds = "0"\n')
     (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "shot"\nmodel = "{model}"\n')
-    for line in ("train --recipe recipe.toml -o out", "sweep recipe.toml -o out", "film film.toml -o out"):
+    for line in ("train --recipe recipe.toml -o out", "film film.toml -o out"):
         status, said = run(line)
         assert (status, len(said.splitlines())) == (2, 1), said
         assert not (here / "touched").exists()
