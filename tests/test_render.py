@@ -5,11 +5,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import json
-import os
 import shutil
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +23,6 @@ from mcdenoise.models import FrameReport, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
-from mcdenoise.scenes.render.processes import render_in_processes
 from mcdenoise.scenes.render.tracer import LLVM, first_working
 
 SHARED_SCENES = Path(__file__).parents[2] / "shared" / "scenes"
@@ -743,48 +738,6 @@ def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:
     for name, tolerance in (("albedo0", 1e-3), ("shading_normal0", 1e-3), ("world_position0", 1e-3), ("color0", 1e-2)):
         different = np.abs(read(moved, name) - read(built, name)).max(axis=-1) > tolerance
         assert different.mean() < 0.02, name
-
-
-class _Ends:
-    """Ends the process that unpickles it."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os._exit, (3,)
-
-
-def test_a_worker_that_dies_gives_one_line() -> None:
-    with pytest.raises(InputError, match="a worker process ended without a word") as caught:
-        render_in_processes(
-            _Ends(),  # type: ignore[arg-type]
-            None,  # type: ignore[arg-type]
-            [0, 1],
-            2,
-            lambda paths: None,
-            lambda number, state: None,
-        )
-    assert "\n" not in str(caught.value)
-
-
-def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
-    script = tmp_path / "parent.py"
-    script.write_text(
-        "import time\n"
-        "from mcdenoise.scenes.render.processes import render_in_processes\n"
-        "class Source:\n"
-        "    def tracer(self):\n"
-        "        print('tracing', flush=True)\n"
-        "        time.sleep(60)\n"
-        "if __name__ == '__main__':\n"
-        "    render_in_processes(Source(), None, [0], 1, print, print)\n"
-    )
-    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        assert parent.stdout.readline() == "tracing\n"
-        parent.kill()
-        killed = time.monotonic()
-        # Its end comes when the last process that could write to it is gone.
-        assert parent.stdout.read() == ""
-    assert time.monotonic() - killed < 30
 
 
 def test_tasks_that_cannot_be_sent_to_workers_are_refused(tmp_path: Path) -> None:

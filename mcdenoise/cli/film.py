@@ -9,22 +9,20 @@ from typing import Annotated
 
 import tyro
 
-from mcdenoise.cli._options import Out
+from mcdenoise.cli._options import Out, Workers
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
-from mcdenoise.cli._shot import ShotOptions
-from mcdenoise.engines import Engine, LocalEngine, RayEngine, processors
+from mcdenoise.engines import open_engine, parse_workers, processors
 from mcdenoise.errors import InputError
 from mcdenoise.film import Film, ShotResult, read_film, run_film, write_page
+from mcdenoise.shot import ShotSettings
 
 
 def film(
     manifest: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="FILM")]],
     out: Out,
-    shot: tyro.conf.OmitArgPrefixes[ShotOptions],
-    workers: int | None = None,
-    ray: str | None = None,
+    model: str | None = None,
+    workers: Workers = "1",
     piece: int = 200,
-    joint: float = 1e-2,
 ) -> int | None:
     """Denoise the shots of a film, by any number of processes or machines: OUT/NAME/ is what denoise writes of a shot.
 
@@ -36,37 +34,26 @@ def film(
             these), and any option of `mcdenoise denoise`; [every] has options of all. Or a pattern of folders, in
             quotes, such as 'renders/*/beauty', each of which is a shot.
         out: folder to write to: a folder for each shot, film.json, and the page film.html.
-        shot: how shots are read, denoised and written; the manifest overrides it.
-        workers: processes of this machine; 1 by default.
-        ray: address of a Ray cluster that denoises instead, such as auto, 10.0.0.1:6379, or local for one on this
-            machine; all machines see the same folders.
+        model: of all shots for which the manifest names none, as for `mcdenoise denoise`; the only place for code of
+            your own, path/to/file.py:factory.
+        workers: number of processes of this machine; or the address of a Ray cluster, such as auto, 10.0.0.1:6379, or
+            local for one on this machine, all machines of which see the same folders.
         piece: largest number of frames that one process denoises of a shot; longer shots are cut into pieces that
             overlap by as many frames as the history needs; 0 cuts none.
-        joint: largest difference of a frame after a joint from that of the uncut shot, as a fraction; it decides the
-            overlap.
     """
     if piece < 0:
         raise InputError(f"--piece: expected at least 0 frames, found {piece}")
-    if not 0 < joint < 1:
-        raise InputError(f"--joint: expected a fraction between 0 and 1, found {joint:g}")
-    if ray is not None and workers is not None:
-        raise InputError("--workers, --ray: expected one of them, found both")
-    shots = read_film(manifest, shot)
+    count = parse_workers(workers)
+    shots = read_film(manifest, ShotSettings(model))
     for settings in {each.settings.model: each.settings for each in shots if each.settings.model}.values():
         # The check of the film names a shot whose model cannot be made.
         with suppress(InputError):
             warn(filter(None, [settings.spelling.doubt]))
-    engine: Engine
-    threads = None
-    if ray is not None:
-        gpus = any(each.settings.device.startswith("cuda") for each in shots)
-        cpus = max(each.settings.threads or 1 for each in shots)
-        engine, threads = RayEngine(ray, cpus=cpus, gpus=float(gpus)), cpus
-    else:
-        workers = 1 if workers is None else workers
-        engine = LocalEngine(workers)
-        threads = max(1, processors() // workers) if workers > 1 else None
-    plan = Film(shots, out, piece, joint, threads)
+    gpus = any(each.settings.device.startswith("cuda") for each in shots)
+    cpus = max(each.settings.threads or 1 for each in shots)
+    engine = open_engine(workers, cpus=cpus, gpus=float(gpus))
+    threads = cpus if count is None else max(1, processors() // count) if count > 1 else None
+    plan = Film(shots, out, piece, threads=threads)
     began = time.perf_counter()
     with progress_bar() as progress:
         task = progress.add_task(f"scan {len(shots)} shots", total=None)
@@ -87,13 +74,12 @@ def film(
             for frames, why in each.failures()
         ]
     )
-    if result.trouble:
-        warn([result.trouble])
     page = ""
     try:
         page = f", {write_page(plan, result)}"
     except InputError as error:
         warn([str(error)])
+    warn(filter(None, [result.trouble]))
     rate = f", {result.made / result.seconds:.2f}/s" if result.made else ""
     done = sum(each.complete for each in result.shots)
     say(
@@ -104,10 +90,9 @@ def film(
 
 def _print_shot(result: ShotResult) -> None:
     """Print one line for a shot that is summarized or has failed."""
-    frames = len(result.found.numbers) if result.found is not None else 0
-    kept = len(result.found.done) if result.found is not None else 0
-    rate = f", {result.rate:.2f}/s" if result.made else ""
+    found = result.found
+    frames, kept = (len(found.numbers), len(found.done)) if found is not None else (0, 0)
     there = f", {kept} were there" if kept else ""
     failed = f", {len(result.failed)} failed" if result.failed else ", failed" if result.reason else ""
-    picked = f"; picked {result.found.shot.picked}" if result.found is not None and result.found.shot.picked else ""
-    say(f"  {result.shot.name}: {frames} frames, {result.made} made{rate}{there}{failed}{picked}")
+    picked = f"; picked {result.shot.picked}" if result.shot.picked else ""
+    say(f"  {result.shot.name}: {frames} frames, {result.made} made{there}{failed}{picked}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -16,7 +15,7 @@ from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.engines import RayEngine, Task, run_tasks
+from mcdenoise.engines import RayEngine, Task, parse_workers, run_tasks
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import default_folder, open_assets
 from mcdenoise.scenes.cycles import Blender
@@ -37,14 +36,11 @@ def generate(
     rendering: tyro.conf.OmitArgPrefixes[RenderOptions] = _FOR_TRAINING,
     seeds: str = "0-15",
     frames: int = _FRAMES,
-    zoom: float = 1.0,
-    noise_seed: int | None = None,
     wild: bool = False,
     sampling: Sampling | None = None,
     stills: float | None = None,
     renderer: Literal["mitsuba", "cycles"] = "mitsuba",
     cycles_spp: int | None = None,
-    blender_python: Path | None = None,
     parts: Flag = False,
     threads: int = 0,
     takes: Flag = False,
@@ -53,17 +49,15 @@ def generate(
 ) -> int | None:
     """Render random rooms, courts and still lifes to sequences to train on: OUT/random0000, OUT/random0001, ...
 
-    The same seed is the same scene and noise anywhere. The same command again resumes a run that was stopped. With
-    --ray, each seed is a task: the task of a lost worker is retried, and seeds that failed are listed at the end, with
-    status 1.
+    The same seed is the same scene and noise anywhere. The same command again resumes a run that was stopped. On a
+    cluster, each seed is a task: the task of a lost worker is retried, and seeds that failed are listed at the end,
+    with status 1.
 
     Args:
         out: folder of the sequences; finished frames in it are kept.
         rendering: samples, references, size and processors.
         seeds: seeds of the scenes, such as 0-99,200.
         frames: frames of each sequence; with --takes 16 by default.
-        zoom: render the middle of an image that is so many times as wide and high.
-        noise_seed: seed of the noise of all scenes; by default each scene takes its own seed.
         wild: frames as renderers' users have them: coats, mirrors, glass and metal in every scene, --sampling mixed,
             --stills 0.5, and for each sequence its own number of samples, from 1 to 64 instead of --spp.
         sampling: every sample at the pixel centre, with features without noise (centre, the default); or as Mitsuba
@@ -72,13 +66,12 @@ def generate(
         stills: fraction of the scenes of which half as many stills are rendered as a clip has frames, each a sequence
             of its own, OUT/random0000_0, OUT/random0000_1, ...
         renderer: with cycles, by Blender, each noisy color has features of its own; pixel filter, depth of field and
-            motion blur are drawn from the seed.
+            motion blur are drawn from the seed. A Python that has Blender's module bpy is named by the environment
+            variable BLENDER_PYTHON, or else is this one.
         cycles_spp: samples a pixel of Cycles' noisy colors; by default drawn from the seed, 1 for half of the scenes.
-        blender_python: a Python that has Blender's module bpy; by default that of the environment variable
-            BLENDER_PYTHON, or else this one.
         parts: with Cycles, also write diffuse and specular light, which add up to each noisy color.
-        threads: threads of Cycles and of --takes; all processors by default. With --ray, the processors that a task
-            takes; 1 by default.
+        threads: threads of Cycles and of --takes; all processors by default. On a cluster, the processors that a
+            task takes; 1 by default.
         takes: packed takes instead of sequences, OUT/000000.take.npz, ..., of furnished rooms, desks, streets, pools
             and things before nothing. --seeds are their numbers. A third are stills, the others have 16 frames with
             references on the last three. Pixel filter, lens, features and samples are drawn, too. The only other
@@ -94,37 +87,29 @@ def generate(
         raise InputError("--assets, --unseen: expected together with --takes, found alone")
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
-    if not 0 < zoom < math.inf:
-        raise InputError(f"--zoom: expected a positive number, found {zoom:g}")
     if stills is not None and not 0 <= stills <= 1:
         raise InputError(f"--stills: expected a fraction from 0 to 1, found {stills:g}")
     if parts and renderer != "cycles":
         raise InputError("--parts: expected together with --renderer cycles: Mitsuba's path integrator has no parts")
-    if rendering.keep_samples and renderer == "cycles":
-        raise InputError("--keep-samples: expected together with --renderer mitsuba: Cycles writes no single samples")
-    if rendering.ray is not None and rendering.workers > 1:
-        raise InputError("--workers, --ray: expected one of them, found both")
-    chosen, arguments = parse_frames(seeds, name="--seeds"), rendering.arguments()
+    chosen, workers = parse_frames(seeds, name="--seeds"), parse_workers(rendering.workers)
+    arguments = {**rendering.arguments(), "workers": workers or 1}
     cycles = renderer == "cycles"
     plan = Generation(
         out=Path(os.path.abspath(out)),
         rendering=arguments,
         frames=frames,
-        zoom=zoom,
-        noise_seed=noise_seed,
         wild=wild,
         sampling=sampling or ("mixed" if wild else "centre"),
         stills=(_WILD_STILLS if wild else 0) if stills is None else stills,
         cycles=cycles,
         cycles_spp=cycles_spp,
-        blender_python=blender_python,
         parts=parts,
         threads=threads,
     )
-    if rendering.ray is not None:
-        return _on_ray(plan, chosen, rendering.ray, out)
+    if workers is None:
+        return _on_ray(plan, chosen, rendering.workers, out)
     with ExitStack() as stack:
-        blender = stack.enter_context(Blender(blender_python)) if cycles else None
+        blender = stack.enter_context(Blender()) if cycles else None
         progress = stack.enter_context(progress_bar())
         scenes = progress.add_task("scenes", total=len(chosen))
 
@@ -181,11 +166,21 @@ def _on_ray(plan: Generation, seeds: list[int], address: str, out: Path) -> int 
     with progress_bar() as progress:
         scenes = progress.add_task("scenes", total=len(seeds))
 
-        def done(task: Task, written: list[Path]) -> None:
-            progress.advance(scenes)
-            for each in written:
-                say(out / each.relative_to(plan.out))
+        failed: list[dict[str, str]] = []
 
-        failed = run_tasks(engine, [Task(f"seed {seed}", render_seed, (plan, seed)) for seed in seeds], done)
-    print_rows([{"scene": name, "failed": reason} for name, reason in failed.items()])
+        def task(seed: int) -> Task:
+            def done(written: list[Path]) -> list[Task]:
+                progress.advance(scenes)
+                for each in written:
+                    say(out / each.relative_to(plan.out))
+                return []
+
+            def fail(reason: str) -> list[Task]:
+                failed.append({"scene": f"seed {seed}", "failed": reason})
+                return []
+
+            return Task(render_seed, (plan, seed), done, fail)
+
+        run_tasks(engine, map(task, seeds))
+    print_rows(failed)
     return 1 if failed else None

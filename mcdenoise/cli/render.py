@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from mcdenoise.cli._options import Flag, Out, parse_size
+from mcdenoise.cli._options import Flag, Out, Workers, parse_size
 from mcdenoise.cli._output import progress_bar, say
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.engines import RayEngine
+from mcdenoise.engines import RayEngine, parse_workers
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render import choose_variant, load_camera_path, render_sequence
 
@@ -24,30 +24,24 @@ class RenderOptions:
     Args:
         spp: samples a pixel of the noisy color.
         noise_seeds: noisy colors of each frame, each with a noise seed of its own.
-        reference_spp: samples a pixel of the references; 0 renders none. With --noise-level the most.
-        noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02.
+        reference_spp: samples a pixel of the references; 0 renders none.
         reference_frames: frames that get a reference, such as 8-11; all by default.
         size: WIDTHxHEIGHT in pixels.
-        workers: processes that render frames side by side; of use with scalar_rgb.
-        ray: address of a Ray cluster that renders instead, such as auto, 10.0.0.1:6379, or local for one on this
-            machine; all machines see the same folders.
+        workers: processes that render side by side, of use with scalar_rgb; or the address of a Ray cluster, such as
+            auto, 10.0.0.1:6379, or local for one on this machine, all machines of which see the same folders.
         variant: Mitsuba variant, such as scalar_rgb or llvm_ad_rgb; the fastest that works by default.
-        keep_samples: also write the single samples of the noisy colors, for methods such as sbmc and layered.
     """
 
     spp: int = 1
     noise_seeds: int = 1
     reference_spp: int = 512
-    noise_level: float | None = None
     reference_frames: str | None = None
     size: str = "640x360"
-    workers: int = 1
-    ray: str | None = None
+    workers: Workers = "1"
     variant: str | None = None
-    keep_samples: Flag = False
 
     def arguments(self) -> dict[str, Any]:
-        """Those of :func:`mcdenoise.scenes.render.render_sequence`."""
+        """Those of ``render_sequence``."""
         if self.reference_spp < 0:
             raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
         frames = self.reference_frames
@@ -56,12 +50,9 @@ class RenderOptions:
             "spp": self.spp,
             "noise_seeds": self.noise_seeds,
             "reference_spp": max(self.reference_spp, 1),
-            "noise_level": self.noise_level,
             "reference_frames": referenced if self.reference_spp > 0 else [],
             "size": parse_size(self.size),
-            "workers": self.workers,
             "variant": self.variant,
-            "keep_samples": self.keep_samples,
         }
 
 
@@ -73,6 +64,8 @@ def render(
     frames: int | None = None,
     every: int = 1,
     seed: int = 0,
+    noise_level: float | None = None,
+    keep_samples: Flag = False,
 ) -> None:
     """Render a Mitsuba 3 scene along a camera path to a sequence in the BMFR layout.
 
@@ -88,19 +81,20 @@ def render(
         frames: render the first so many cameras; all by default.
         every: take only every n-th camera of the path.
         seed: seed of the noise.
+        noise_level: refine each reference until its estimated SMAPE is this small, such as 0.02, or has
+            --reference-spp samples.
+        keep_samples: also write the single samples of the noisy colors, for methods such as sbmc and layered.
     """
     if every < 1:
         raise InputError(f"--every: expected at least 1, found {every}")
-    arguments = rendering.arguments()
-    if rendering.ray is not None and rendering.workers > 1:
-        raise InputError("--workers, --ray: expected one of them, found both")
+    arguments, workers = rendering.arguments(), parse_workers(rendering.workers)
     shot = load_camera_path(camera_path)
     engine = None
-    if rendering.ray is not None:
+    if workers is None:
         # Workers have other working folders.
         scene, out = Path(os.path.abspath(scene)), Path(os.path.abspath(out))
         arguments["variant"] = choose_variant(rendering.variant)
-        engine = RayEngine(rendering.ray, gpus=float(arguments["variant"].startswith("cuda")))
+        engine = RayEngine(rendering.workers, gpus=float(arguments["variant"].startswith("cuda")))
     with progress_bar() as progress:
         task = progress.add_task("render", total=None)
         written = render_sequence(
@@ -111,6 +105,9 @@ def render(
             frames=frames,
             moves={name: path[::every] for name, path in shot.moves.items()},
             seed=seed,
+            noise_level=noise_level,
+            keep_samples=keep_samples,
+            workers=workers or 1,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
             **arguments,
         )

@@ -1,12 +1,11 @@
-"""The driver: schedules the tasks of a film, counts finished frames, and retries tasks whose workers are lost."""
+"""The driver: hands the tasks of a film to an engine, and says what came of them."""
 
 from __future__ import annotations
 
 import os
 import secrets
 import time
-from collections import deque
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -14,20 +13,21 @@ from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import held, sweep, write_json
-from mcdenoise.engines import MOST_LOSSES, Done, Engine, RayEngine, describe_error
+from mcdenoise.engines import Engine, RayEngine, Task, run_tasks
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
-from mcdenoise.film.record import Tail, read_journal
-from mcdenoise.film.work import RECORDS, Found, Made, Order, Summary
+from mcdenoise.film.record import Counter
+from mcdenoise.film.work import RECORDS, Found, Order, Summary
 from mcdenoise.folder import make_folder
 from mcdenoise.results import Results
 
-_SECONDS_BETWEEN_POLLS = 0.2
-# Seconds between reading all journals: a thousand of them cost no more than some hundred reads a second.
-_SECONDS_BETWEEN_COUNTS, _SECONDS_A_JOURNAL = 0.5, 0.002
 FILE = "film.json"
+# All shots are scanned first, so that wrong input is reported early and the time left is known.
+_SCAN, _SUMMARIZE, _MAKE = range(3)
+# Seconds between readings of the journals, at least, and as a multiple of what one takes.
+_PAUSE, _PAUSES = 0.5, 20
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class Film:
         shots: in the order in which they are started.
         out: output folder; each shot gets a folder of its name in it.
         piece: largest number of frames in a piece; 0 does not cut shots.
-        joint: largest difference of a frame from that of the uncut shot, as a fraction.
+        joint: largest difference of a frame from that of the uncut shot, as a fraction; it decides how many frames
+            before its first a piece begins.
         threads: of torch in each worker; ``None`` for its own choice.
     """
 
@@ -48,27 +49,19 @@ class Film:
     joint: float = 1e-2
     threads: int | None = None
 
-    def order(self, shot: Shot) -> Order:
-        """The order that every task of a shot gets."""
-        return Order(shot, Path(os.path.abspath(self.out)), self.joint, self.threads)
-
 
 @dataclass
 class ShotResult:
     """The state of a shot.
 
     Args:
-        shot: the shot.
+        shot: the shot; with the model that was picked, after the scan.
         found: result of the scan; ``None`` before it.
         made: number of frames that were denoised in this run.
         failed: for each failed frame, by number, the reason.
         reason: why the whole shot failed; empty if it did not.
         summary: of the finished frames; ``None`` before the last task of the shot.
-        traces: tracebacks of failures that the input did not cause.
-        begun: time at which the first piece was started, seconds.
-        ended: time at which the last piece ended, seconds.
         repeated: number of frames that were denoised again because their files had changed meanwhile.
-        pieces: number of pieces into which the shot was cut.
         waiting: number of pieces that have not ended.
     """
 
@@ -78,11 +71,7 @@ class ShotResult:
     failed: dict[int, str] = field(default_factory=dict)
     reason: str = ""
     summary: Summary | None = None
-    traces: list[str] = field(default_factory=list)
-    begun: float = 0.0
-    ended: float = 0.0
     repeated: int = 0
-    pieces: int = 0
     waiting: int = 0
 
     @property
@@ -91,9 +80,9 @@ class ShotResult:
         return self.summary is not None and not self.failed and not self.reason
 
     @property
-    def rate(self) -> float:
-        """Frames a second, from the beginning of the first piece to the end of the last."""
-        return self.made / max(self.ended - self.begun, 1e-3) if self.made else 0.0
+    def to_make(self) -> int | None:
+        """Number of frames that this run has to denoise; ``None`` before the scan."""
+        return None if self.found is None else len(self.found.numbers) - len(self.found.done) + self.repeated
 
     def failures(self) -> list[tuple[str, str]]:
         """The failed frames and the reasons; neighbours with the same reason are one row."""
@@ -132,18 +121,6 @@ class FilmResult:
         return sum(each.made for each in self.shots)
 
 
-@dataclass
-class _Task:
-    """One task, with what its retry needs."""
-
-    kind: str
-    result: ShotResult
-    piece: Piece | None = None
-    journal: Path | None = None
-    tail: Tail | None = None
-    lost: int = 0
-
-
 def run_film(
     film: Film,
     engine: Engine,
@@ -171,12 +148,7 @@ def run_film(
         _check(film, device="cpu" if isinstance(engine, RayEngine) else "")
         make_folder(film.out / RECORDS)
         with held(film.out / RECORDS, "film"):
-            run = _Run(film, engine, on_progress, on_shot)
-            try:
-                return run.run()
-            finally:
-                engine.close()
-                run.sweep()
+            return _run(film, engine, on_progress, on_shot)
     finally:
         engine.close()
 
@@ -203,167 +175,106 @@ def _check(film: Film, device: str) -> None:
                 raise InputError(f"shot '{shot.name}': {error}") from error
 
 
-class _Run:
-    def __init__(
-        self,
-        film: Film,
-        engine: Engine,
-        on_progress: Callable[[int, int | None], None],
-        on_shot: Callable[[ShotResult], None],
-    ) -> None:
-        self.film, self.engine, self.on_progress, self.on_shot = film, engine, on_progress, on_shot
-        self.result = FilmResult([ShotResult(shot) for shot in film.shots])
-        # All shots are scanned first, so that wrong input is reported early and the time left is known.
-        self.queue = deque(_Task("scan", each) for each in self.result.shots)
-        self.running: dict[Hashable, _Task] = {}
-        self.unscanned = len(film.shots)
-        self.began = self.counted = time.monotonic()
-        self.reported: tuple[int, int | None] = (-1, None)
+def _run(
+    film: Film,
+    engine: Engine,
+    on_progress: Callable[[int, int | None], None],
+    on_shot: Callable[[ShotResult], None],
+) -> FilmResult:
+    began, created = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
+    run, out = f"{secrets.token_hex(8)}-", Path(os.path.abspath(film.out))
+    shots = [_Shot(film, Order(each, out, film.joint, film.threads, run), on_shot) for each in film.shots]
+    result = FilmResult([each.result for each in shots])
+    pause, counted = _PAUSE, began
 
-    def run(self) -> FilmResult:
-        created = datetime.now(UTC).isoformat(timespec="seconds")
+    def count() -> None:
+        nonlocal pause, counted
+        if (start := time.monotonic()) - counted >= pause:
+            for each in shots:
+                each.count()
+            counted = time.monotonic()
+            pause = max(_PAUSE, _PAUSES * (counted - start))
+            totals = [each.to_make for each in result.shots if not each.reason]
+            on_progress(result.made, None if None in totals else sum(filter(None, totals)))
+
+    try:
+        run_tasks(engine, [each.scan() for each in shots], count)
+    finally:
+        # No worker is alive any more: what is half-written belongs to those that were killed.
+        for each in shots:
+            each.count()
+            for folder in (each.order.folder, each.order.records):
+                sweep(folder, youngest=0)
+        result.seconds = time.monotonic() - began
         try:
-            while self.queue or self.running:
-                for _ in range(min(len(self.queue), self.engine.free_slots()) if self.queue else 0):
-                    self._submit(self.queue.popleft())
-                for handle, done in self.engine.finished(_SECONDS_BETWEEN_POLLS).items():
-                    self._ended(self.running.pop(handle), done)
-                self._count()
-        finally:
-            self.result.seconds = time.monotonic() - self.began
-            try:
-                write_json(self.film.out / FILE, _as_json(self.film, self.result, created))
-            except InputError as error:
-                self.result.trouble = str(error)
-        return self.result
+            write_json(film.out / FILE, _as_json(film, result, created))
+        except InputError as error:
+            result.trouble = str(error)
+    return result
 
-    def sweep(self) -> None:
-        """Remove the half-written files of workers that were killed; no worker is alive any more."""
-        for each in self.result.shots:
-            if each.begun:
-                order = self.film.order(each.shot)
-                for folder in (order.folder, order.records):
-                    sweep(folder, youngest=0)
 
-    def _submit(self, task: _Task) -> None:
-        result = task.result
-        shot = result.found.shot if result.found is not None else result.shot
-        order = self.film.order(shot)
-        if task.kind == "scan":
-            handle = self.engine.submit(work.scan, order)
-        elif task.kind == "summarize":
-            handle = self.engine.submit(work.summarize, order)
-        else:
-            # A new name for each attempt, because a lost worker may still be alive and write to the old one.
-            task.journal = order.records / f"{secrets.token_hex(8)}.jsonl"
-            task.tail = Tail(task.journal)
-            result.begun = result.begun or time.monotonic()
-            handle = self.engine.submit(work.make, order, task.piece, task.journal)
-        self.running[handle] = task
+class _Shot:
+    """The tasks of a shot, each of which says what comes next."""
 
-    def _ended(self, task: _Task, done: Done) -> None:
-        if task.tail is not None:
-            new = task.tail.new()
-            task.result.made += new
-        if done.lost:
-            self._lost(task, done.lost)
-        elif done.error is not None:
-            self._failed(task, done.error)
-        elif task.kind == "scan":
-            self._scanned(task.result, done.answer)
-        elif task.kind == "make":
-            self._made(task, done.answer)
-        else:
-            self._summarized(task.result, done.answer)
+    def __init__(self, film: Film, order: Order, on_shot: Callable[[ShotResult], None]) -> None:
+        self.film, self.order, self.on_shot = film, order, on_shot
+        self.result = ShotResult(order.shot)
+        self._counter = Counter(order.records, order.run)
 
-    def _scanned(self, result: ShotResult, found: Found) -> None:
-        self.unscanned -= 1
-        result.found = found
-        result.failed.update(found.unreadable)
-        self._cut(result, set(found.numbers) - found.done)
-        if not result.waiting:
-            self._summarize(result)
+    def count(self) -> int:
+        """Count the frames that were finished in this run."""
+        self.result.made = self._counter.count()
+        return self.result.made
 
-    def _cut(self, result: ShotResult, missing: set[int], lost: int = 0) -> None:
-        if result.found is None:
-            return
-        pieces = cut(result.found.numbers, missing, self.film.piece, result.found.overlap)
-        tasks = [_Task("make", result, piece, lost=lost) for piece in pieces]
-        result.pieces = result.pieces or len(pieces)
-        result.waiting += len(pieces)
-        # Retries come first, because their shots are nearest to their ends.
-        self.queue.extendleft(reversed(tasks)) if lost else self.queue.extend(tasks)
+    def scan(self) -> Task:
+        return Task(work.scan, (self.order,), self._scanned, self._failed, _SCAN)
 
-    def _made(self, task: _Task, made: Made) -> None:
-        task.result.failed.update(made.failed)
-        if made.trace:
-            task.result.traces.append(made.trace)
-        self._piece_ended(task.result)
+    def _scanned(self, found: Found) -> Iterable[Task]:
+        self.result.found, self.result.shot = found, found.shot
+        self.result.failed.update(found.unreadable)
+        self.order = replace(self.order, shot=found.shot)
+        return self._make(found, set(found.numbers) - found.done)
 
-    def _piece_ended(self, result: ShotResult) -> None:
-        result.waiting -= 1
-        result.ended = time.monotonic()
-        if not result.waiting:
-            self._summarize(result)
+    def _make(self, found: Found, missing: set[int]) -> Iterable[Task]:
+        pieces = cut(found.numbers, missing, self.film.piece, found.overlap)
+        self.result.waiting = len(pieces)
+        return [self._piece(each) for each in pieces] or [self._summarize()]
 
-    def _summarize(self, result: ShotResult) -> None:
-        self.queue.appendleft(_Task("summarize", result))
+    def _piece(self, piece: Piece) -> Task:
+        def made(failures: Mapping[int, str]) -> Iterable[Task]:
+            self.result.failed.update(failures)
+            self.result.waiting -= 1
+            return [] if self.result.waiting else [self._summarize()]
 
-    def _summarized(self, result: ShotResult, summary: Summary) -> None:
+        def failed(reason: str) -> Iterable[Task]:
+            return made(dict.fromkeys(piece.wanted, reason))
+
+        return Task(work.make, (self.order, piece), made, failed, _MAKE, self.count)
+
+    def _summarize(self) -> Task:
+        return Task(work.summarize, (self.order,), self._summarized, self._failed, _SUMMARIZE)
+
+    def _summarized(self, summary: Summary) -> Iterable[Task]:
         """Denoise frames again whose files have changed meanwhile, once; those that change again are not finished."""
-        changed = set(summary.unfinished) - set(result.failed)
-        if changed and not result.repeated:
+        result, unfinished = self.result, set(summary.unfinished)
+        # Frames of a lost piece may be finished.
+        unreadable = result.found.unreadable if result.found is not None else {}
+        result.failed = {n: why for n, why in result.failed.items() if n in unfinished or n in unreadable}
+        changed = unfinished - result.failed.keys()
+        if changed and result.found is not None and not result.repeated:
             result.repeated = len(changed)
-            self._cut(result, changed)
-            return
+            return self._make(result.found, changed)
         reason = "its files have changed while the film was made, and once more; run the same command when they stay"
         result.failed.update(dict.fromkeys(changed, reason))
+        self.count()
         result.summary = summary
         self.on_shot(result)
+        return []
 
-    def _lost(self, task: _Task, why: str) -> None:
-        """Retry a task whose worker is lost; the frames that it has finished are on the disk."""
-        done = _finished(task)
-        task.lost = 1 if done else task.lost + 1
-        if task.lost >= MOST_LOSSES:
-            self._failed(task, InputError(f"{why}, {task.lost} times in a row"))
-        elif task.piece is None:
-            self.queue.appendleft(_Task(task.kind, task.result, lost=task.lost))
-        else:
-            self._cut(task.result, set(task.piece.wanted) - done, task.lost)
-            self._piece_ended(task.result)
-
-    def _failed(self, task: _Task, error: BaseException) -> None:
-        result, reason = task.result, describe_error(error)
-        if task.piece is not None:
-            result.failed.update(dict.fromkeys(set(task.piece.wanted) - _finished(task), reason))
-            self._piece_ended(result)
-            return
-        if task.kind == "scan":
-            self.unscanned -= 1
-        result.reason = reason
-        self.on_shot(result)
-
-    def _count(self) -> None:
-        """Report the number of finished frames, if some time has passed since the last report."""
-        pause = max(_SECONDS_BETWEEN_COUNTS, _SECONDS_A_JOURNAL * len(self.running))
-        if time.monotonic() - self.counted >= pause:
-            self.counted = time.monotonic()
-            for task in self.running.values():
-                if task.tail is not None:
-                    task.result.made += task.tail.new()
-        known = [each for each in self.result.shots if each.found is not None]
-        total = sum(
-            len(each.found.numbers) - len(each.found.done) + each.repeated for each in known if each.found is not None
-        )
-        progress = (self.result.made, None if self.unscanned else total)
-        if progress != self.reported:
-            self.reported = progress
-            self.on_progress(*progress)
-
-
-def _finished(task: _Task) -> set[int]:
-    return {record.number for record in read_journal(task.journal)} if task.journal is not None else set()
+    def _failed(self, reason: str) -> Iterable[Task]:
+        self.result.reason = reason
+        self.on_shot(self.result)
+        return []
 
 
 def _as_json(film: Film, result: FilmResult, created: str) -> dict[str, Any]:
@@ -380,7 +291,7 @@ def _as_json(film: Film, result: FilmResult, created: str) -> dict[str, Any]:
 
 
 def _shot_as_json(result: ShotResult) -> dict[str, Any]:
-    shot = result.found.shot if result.found is not None else result.shot
+    shot, found, summary = result.shot, result.found, result.summary
     settings = {key: value for key, value in asdict(shot.settings).items() if value not in (None, (), False)}
     about: dict[str, Any] = {
         "name": shot.name,
@@ -388,24 +299,16 @@ def _shot_as_json(result: ShotResult) -> dict[str, Any]:
         "settings": {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()},
         "complete": result.complete,
         "made": result.made,
-        "frames_per_second": round(result.rate, 3),
-        "pieces": result.pieces,
         "failed": [{"frames": frames, "why": why} for frames, why in result.failures()],
-        "traces": result.traces,
     }
-    if result.found is not None:
-        found = {"frames": list(result.found.numbers), "found_finished": len(result.found.done)}
-        about |= {**found, "overlap": result.found.overlap, "picked": shot.picked}
-    if result.summary is not None:
-        about |= _summary_as_json(result.summary)
+    if found is not None:
+        about |= {"frames": list(found.numbers), "found_finished": len(found.done)}
+        about |= {"overlap": found.overlap, "picked": shot.picked}
+    if summary is not None:
+        about |= {
+            "milliseconds": summary.milliseconds,
+            "worst": [row["number"] for row in sorted(summary.frames, key=lambda row: -row["score"])[:3]],
+            "resets": {str(row["number"]): row["reset"] for row in summary.frames if row["reset"]},
+            "warnings": list(summary.warnings),
+        }
     return about
-
-
-def _summary_as_json(summary: Summary) -> Mapping[str, Any]:
-    return {
-        "milliseconds": summary.milliseconds,
-        "joints": {str(number): difference for number, difference in summary.joints.items()},
-        "worst": [row["number"] for row in sorted(summary.frames, key=lambda row: -row["score"])[:3]],
-        "resets": {str(row["number"]): row["reset"] for row in summary.frames if row["reset"]},
-        "warnings": list(summary.warnings),
-    }

@@ -6,9 +6,10 @@ import difflib
 import glob
 import os
 import tomllib
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from mcdenoise.data.sequences import parse_frames
@@ -50,14 +51,15 @@ def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot
         manifest: a TOML file with a table ``[[shot]]`` for each shot, which has ``name``, ``input`` (a folder, a file,
             a pattern, or a list of these, beside the manifest where they are not absolute), and any setting of
             :class:`mcdenoise.shot.ShotSettings`, but no model of one's own, which is code and named by ``settings``; a
-            table ``[every]`` has settings of all shots. Or a pattern of folders such as ``renders/*/beauty``: each
-            folder is a shot, and is named by the parts that match wildcards.
+            table ``[every]`` has settings of all shots. In place of the tables, ``shots`` may be a pattern of folders.
+            Or a pattern of folders alone, such as ``renders/*/beauty``: each folder is a shot, and is named by the
+            parts that match wildcards.
         settings: of all shots; the manifest overrides them.
 
     Raises:
         InputError: the manifest cannot be read, has no shots, or has an unknown key or a wrong value.
     """
-    settings = _absolute(settings or ShotSettings(), Path.cwd())
+    settings = _absolute(settings or ShotSettings(), Path.cwd(), ("model", "weights", "results"))
     shots = _of_file(manifest, settings) if manifest.suffix == ".toml" else _of_pattern(manifest, settings)
     names: dict[str, Shot] = {}
     for shot in shots:
@@ -91,18 +93,21 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     # An integer of too many digits is a ValueError, as are all others.
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected TOML, found: {error}; mend it there") from error
-    if unknown := sorted(content.keys() - {"shot", "every"}):
+    if unknown := sorted(content.keys() - {"shot", "every", "shots"}):
         raise InputError(
             f"{path}: expected tables [[shot]] and perhaps [every], found '{unknown[0]}'; settings stand in one of them"
         )
-    tables, every = content.get("shot"), content.get("every", {})
-    if not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
-        raise InputError(
-            f"{path}: expected a table [[shot]] for each shot, found none; write [[shot]] with name, input"
-        )
+    every, tables, pattern = content.get("every", {}), content.get("shot"), content.get("shots")
     if not isinstance(every, dict):
         raise InputError(f"{path}: expected 'every' to be a table, found {_found(every)}; write [every]")
     settings = _settings(every, settings, f"{path}, [every]", path.parent)
+    if isinstance(pattern, str) and tables is None:
+        return _of_pattern(path.parent / pattern, settings)
+    if not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
+        raise InputError(
+            f"{path}: expected a table [[shot]] for each shot, found none; write [[shot]] with name, input; or shots = "
+            "'a pattern of folders'"
+        )
     shots = []
     for number, table in enumerate(tables, 1):
         name = table.get("name")
@@ -161,42 +166,33 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
 def _typed(kind: Any, value: Any, where: str) -> Any:
     """Convert a value of TOML to the type of a setting."""
     # TOML has no null: a setting that is None is not in the table.
-    kinds = [each for each in (get_args(kind) if get_origin(kind) not in (tuple, Literal) else [kind]) or [kind]]
-    kind = next(each for each in kinds if each is not type(None))
-    if get_origin(kind) is Literal and value in get_args(kind):
-        return value
-    if get_origin(kind) is tuple:
-        texts = [value] if isinstance(value, str) else value
-        if isinstance(texts, list) and all(isinstance(each, str) for each in texts):
-            return tuple(texts)
-        raise InputError(f"{where}: expected a text or a list of texts, found {_found(value)}; write them in quotes")
+    if NoneType in get_args(kind):
+        (kind,) = (each for each in get_args(kind) if each is not NoneType)
     if get_origin(kind) is Literal:
-        expected = f"one of {', '.join(get_args(kind))}"
-        raise InputError(f"{where}: expected {expected}, found {_found(value)}; choose one")
-    # In Python, True and False are integers.
-    fits = isinstance(value, bool) is (kind is bool) and isinstance(
-        value, (int, float) if kind is float else str if kind is Path else kind
-    )
-    # Written so that NaN is out of range.
-    if fits and not isinstance(value, str) and not abs(value) < _LIMIT:
-        raise InputError(f"{where}: expected {_WORDS[kind]} below 2^63, found {_found(value)}; change it")
+        fits, expected, made = value in get_args(kind), f"one of {', '.join(get_args(kind))}", lambda: value
+    elif get_origin(kind) is tuple:
+        texts = [value] if isinstance(value, str) else value
+        fits = isinstance(texts, list) and all(isinstance(each, str) for each in texts)
+        expected, made = "a text or a list of texts", lambda: tuple(texts)
+    else:
+        # In Python, True and False are integers.
+        fits = isinstance(value, bool) is (kind is bool)
+        fits = fits and isinstance(value, (int, float) if kind is float else str if kind is Path else kind)
+        # Written so that NaN is out of range.
+        fits = fits and (isinstance(value, str) or abs(value) < _LIMIT)
+        expected, made = f"{_WORDS[kind]}{' below 2^63' if kind in (int, float) else ''}", lambda: kind(value)
     if not fits:
-        raise InputError(f"{where}: expected {_WORDS[kind]}, found {_found(value)}; change it")
-    return kind(value)
+        raise InputError(f"{where}: expected {expected}, found {_found(value)}; change it")
+    return made()
 
 
-def _absolute(settings: ShotSettings, base: Path, chosen: Collection[str] | None = None) -> ShotSettings:
-    """The settings with absolute paths, because workers may have other working folders."""
-    kinds = get_type_hints(ShotSettings)
+def _absolute(settings: ShotSettings, base: Path, chosen: Iterable[str]) -> ShotSettings:
+    """The settings with absolute paths in the chosen ones, because workers may have other working folders."""
     changed: dict[str, Any] = {}
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        if value is None or (chosen is not None and each.name not in chosen):
-            continue
-        if Path in get_args(kinds[each.name]):
-            changed[each.name] = Path(os.path.abspath(base / value))
-    model = settings.model
-    if model is not None and (chosen is None or "model" in chosen):
+    for name in {"weights", "results"} & set(chosen):
+        if (path := getattr(settings, name)) is not None:
+            changed[name] = Path(os.path.abspath(base / path))
+    if "model" in chosen and (model := settings.model) is not None:
         name = model.partition("(")[0].strip()
         if name.endswith(WEIGHTS) or ".py:" in name:
             changed["model"] = os.path.abspath(base / model)

@@ -44,7 +44,6 @@ def write_page(film: Film, result: FilmResult) -> Path:
         "frames": sum(shot["frames"] for shot in shots),
         "failed": sum(len(each.failed) for each in result.shots),
         "seconds": result.seconds,
-        "joint": film.joint,
         "size": (_WIDTH, _HEIGHT),
     }
     write_text(path, render_page("film.html.jinja", content))
@@ -63,11 +62,9 @@ def _shown(result: ShotResult) -> dict[str, Any]:
         "score": worst[0]["score"] if worst else 0.0,
         "frames": len(result.found.numbers) if result.found is not None else 0,
         "made": result.made,
-        "picked": result.found.shot.picked if result.found is not None else "",
-        "rate": result.rate,
+        "picked": result.shot.picked,
         "failures": result.failures(),
         "warnings": () if result.summary is None else result.summary.warnings,
-        "joints": {} if result.summary is None else result.summary.joints,
         "resets": [(row["number"], row["reset"]) for row in rows if row["reset"]],
         "replaced": sum(row["replaced_pixels"] for row in rows),
         "worst": [{**row, "picture": quote(pictures[row["number"]])} for row in worst if row["number"] in pictures],

@@ -18,12 +18,6 @@ class Piece:
     numbers: tuple[int, ...]
     wanted: tuple[int, ...]
 
-    @property
-    def joint(self) -> int | None:
-        """The frame before the first one that is written, which another piece writes; ``None`` where a shot begins."""
-        place = self.numbers.index(self.wanted[0])
-        return self.numbers[place - 1] if place else None
-
 
 def cut(numbers: Sequence[int], missing: Collection[int], length: int, overlap: int | None) -> list[Piece]:
     """Cut a shot into pieces of equal length, and take the missing frames of each.

@@ -11,11 +11,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import platform
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from mcdenoise.models import FrameReport, Stage
 Stamp = tuple[str, int, int]
 # Nanoseconds, the largest step of the clock of a file system.
 _YOUNG = 2_000_000_000
-_BLOCK, _REMEMBERED = 1 << 20, 256
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,8 @@ class FrameRecord:
                 return None
             report = found["report"]
             report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
-            filled, limited, clamped, negative, gained, place = report["repairs"]
-            report["repairs"] = Repairs(filled, limited, clamped, negative, gained, tuple(place))
+            *counts, place = report["repairs"]
+            report["repairs"] = Repairs(*counts, tuple(place))
             inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])
             own = {**found, "result": _stamp(found["result"]), "inputs": inputs, "report": FrameReport(**report)}
             return cls(**own)
@@ -92,38 +91,24 @@ def stamp(path: Path) -> Stamp:
     return str(path), status.st_size, status.st_mtime_ns
 
 
-class Digests:
-    """Digests of files, cached by their stamps.
+def stamp_and_digest(path: Path, recorded: Mapping[Stamp, str]) -> tuple[Stamp, str]:
+    """Stamp and digest of a file, which is read only if it is not recorded; no digest of one that cannot be read."""
+    try:
+        status = os.stat(path)
+        # A copy may keep the time of its source, but not that of the last change of its entry.
+        changed = max(status.st_mtime_ns, status.st_ctime_ns)
+        if time.time_ns() - changed <= _YOUNG:
+            return (str(path), status.st_size, -1), digest_of(path)
+        found = str(path), status.st_size, changed
+        return found, recorded.get(found) or _digest_of(found)
+    except OSError:
+        return (str(path), -1, -1), ""
 
-    The cache holds the digests of all records that it was given, and of the last 256 files that it has read.
-    """
 
-    def __init__(self) -> None:
-        self._recorded: dict[Stamp, str] = {}
-        self._computed: dict[Stamp, str] = {}
-
-    def of(self, path: Path) -> tuple[Stamp, str]:
-        """Stamp and digest of a file; the digest of a file that cannot be read is empty."""
-        try:
-            status = os.stat(path)
-            # A copy may keep the time of its source, but not that of the last change of its entry.
-            changed = max(status.st_mtime_ns, status.st_ctime_ns)
-            if time.time_ns() - changed <= _YOUNG:
-                return (str(path), status.st_size, -1), digest_of(path)
-            found = str(path), status.st_size, changed
-            digest = self._recorded.get(found) or self._computed.pop(found, "") or digest_of(path)
-            # The newest entry is the last one of the dictionary, and the first one is dropped.
-            self._computed[found] = digest
-            if len(self._computed) > _REMEMBERED:
-                del self._computed[next(iter(self._computed))]
-            return found, digest
-        except OSError:
-            return (str(path), -1, -1), ""
-
-    def learn(self, records: Iterable[FrameRecord]) -> None:
-        """Take the digests of records."""
-        for record in records:
-            self._recorded.update(record.inputs)
+# Frames may share a file.
+@lru_cache(256)
+def _digest_of(file: Stamp) -> str:
+    return digest_of(Path(file[0]))
 
 
 def digest_of(path: Path) -> str:
@@ -132,11 +117,8 @@ def digest_of(path: Path) -> str:
     Raises:
         OSError: the file cannot be read.
     """
-    digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def digest_text(*parts: str) -> str:
@@ -148,31 +130,29 @@ class Journal:
     """The records of one attempt at a piece, a line a frame.
 
     Each attempt has a journal of its own: a worker that is taken for lost may still write to its own.
-
-    Args:
-        path: of the file; its folder is created.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, handle: int) -> None:
         self.path = path
+        self._handle = handle
 
+    @classmethod
     @contextmanager
-    def open(self) -> Iterator[Journal]:
-        """Open the journal for the duration of a ``with`` block.
+    def open(cls, path: Path) -> Iterator[Journal]:
+        """Create a journal, and its folder, for the duration of a ``with`` block.
 
         Raises:
             InputError: the file cannot be written.
         """
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._handle = os.open(self.path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o666)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o666)
         except OSError as error:
-            raise self._refused(error) from error
+            raise _refused(path, error.strerror) from error
         try:
-            self._write(json.dumps({"process": os.getpid(), "node": platform.node()}))
-            yield self
+            yield cls(path, handle)
         finally:
-            os.close(self._handle)
+            os.close(handle)
 
     def add(self, record: FrameRecord) -> None:
         """Add the record of a finished frame.
@@ -180,62 +160,54 @@ class Journal:
         Raises:
             InputError: the file cannot be written.
         """
-        self._write(record.line())
-
-    def _write(self, line: str) -> None:
         # A full disk may have cut off the line before.
-        content = f"\n{line}\n".encode()
+        content = f"\n{record.line()}\n".encode()
         try:
             if os.write(self._handle, content) < len(content):
-                raise InputError(f"{self.path}: cannot be written (it is cut off); check the free space")
+                raise _refused(self.path, "it is cut off")
         except OSError as error:
-            raise self._refused(error) from error
+            raise _refused(self.path, error.strerror) from error
 
-    def _refused(self, error: OSError) -> InputError:
-        return InputError(f"{self.path}: cannot be written ({error.strerror}); check the folder and free space")
+
+def _refused(path: Path, reason: str | None) -> InputError:
+    return InputError(f"{path}: cannot be written ({reason}); check the folder and the free space")
 
 
 def read_records(folder: Path) -> dict[int, FrameRecord]:
     """The last record of each frame in the journals of a folder, by number."""
     found: dict[int, FrameRecord] = {}
     for path in sorted(folder.glob("*.jsonl")):
-        for record in read_journal(path):
-            if record.number not in found or found[record.number].at <= record.at:
-                found[record.number] = record
+        # A pipe of such a name would be waited for.
+        if not path.is_file():
+            continue
+        with suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
+            for record in filter(None, map(FrameRecord.of, file)):
+                if record.number not in found or found[record.number].at <= record.at:
+                    found[record.number] = record
     return found
 
 
-def read_journal(path: Path) -> Iterator[FrameRecord]:
-    """The records of one journal; none if it cannot be read."""
-    # A pipe of such a name would be waited for.
-    if not path.is_file():
-        return
-    with suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if (record := FrameRecord.of(line)) is not None:
-                yield record
-
-
-class Tail:
-    """Counts the records of a journal while a worker writes it.
+class Counter:
+    """Counts the frames that a run has finished, while workers add records of them.
 
     Args:
-        path: of the journal, which need not exist yet.
+        folder: of the journals.
+        run: the beginning of the names of the journals of this run.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._offset = 0
+    def __init__(self, folder: Path, run: str) -> None:
+        self._folder, self._run = folder, run
+        self._read: dict[Path, int] = {}
+        self._count = 0
 
-    def new(self) -> int:
-        """The number of frames that were finished since the last call."""
-        try:
-            with self.path.open("rb") as file:
-                file.seek(self._offset)
+    def count(self) -> int:
+        """The number of frames."""
+        for path in self._folder.glob(f"{self._run}*.jsonl"):
+            with suppress(OSError), path.open("rb") as file:
+                file.seek(self._read.get(path, 0))
                 content = file.read()
-        except OSError:
-            return 0
-        # A line that is still being written is counted by the next call.
-        whole = content.rfind(b"\n") + 1
-        self._offset += whole
-        return sum(line.startswith(b'{"number"') for line in content[:whole].split(b"\n"))
+                # A line that is still being written is counted by the next call.
+                whole = content.rfind(b"\n") + 1
+                self._read[path] = self._read.get(path, 0) + whole
+                self._count += sum(line.startswith(b'{"number"') for line in content[:whole].split(b"\n"))
+        return self._count

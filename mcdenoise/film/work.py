@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import functools
 import os
-import traceback
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
+import secrets
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,19 +22,26 @@ from torch import Tensor
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
-from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import remove, sweep
-from mcdenoise.data.images import Window
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
+from mcdenoise.engines import describe_error
 from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import PICTURES, Shot
-from mcdenoise.film.pieces import Piece
-from mcdenoise.film.record import Digests, FrameRecord, Journal, Stamp, digest_of, digest_text, read_records, stamp
+from mcdenoise.film.pieces import Piece, cut
+from mcdenoise.film.record import (
+    FrameRecord,
+    Journal,
+    Stamp,
+    digest_of,
+    digest_text,
+    read_records,
+    stamp,
+    stamp_and_digest,
+)
 from mcdenoise.folder import FrameError, check_apart, make_folder, new_report, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
-from mcdenoise.metrics import smape_linear
 from mcdenoise.models import find_weights, frames_remembered
 from mcdenoise.preview import Preview
 
@@ -53,15 +60,16 @@ class Order:
     Args:
         shot: the shot.
         out: folder of the film, as an absolute path.
-        joint: largest difference of a frame from that of the uncut shot, see
-            :func:`mcdenoise.models.frames_remembered`.
+        joint: see :class:`mcdenoise.film.Film`.
         threads: of torch; ``None`` for its own choice.
+        run: the beginning of the names of the journals of this run.
     """
 
     shot: Shot
     out: Path
     joint: float
     threads: int | None = None
+    run: str = ""
 
     @property
     def folder(self) -> Path:
@@ -95,7 +103,6 @@ class Found:
         done: numbers of the finished frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
         overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
-        warnings: of the reader.
     """
 
     shot: Shot
@@ -103,20 +110,6 @@ class Found:
     done: frozenset[int]
     unreadable: Mapping[int, str]
     overlap: int | None
-    warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Made:
-    """The failures of :func:`make`.
-
-    Args:
-        failed: for each failed frame, by number, the reason.
-        trace: traceback of a failure that the input did not cause.
-    """
-
-    failed: Mapping[int, str] = field(default_factory=dict)
-    trace: str = ""
 
 
 @dataclass(frozen=True)
@@ -126,8 +119,6 @@ class Summary:
     Args:
         milliseconds: median run time of each stage.
         frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
-        joints: for each joint, by the number of the frame before it, the SMAPE between the two results of that frame:
-            with the whole history, and with that of the overlap alone.
         pictures: paths of the thumbnails, by number of the frame, relative to the page.
         warnings: what is probably wrong, a line each.
         unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
@@ -135,7 +126,6 @@ class Summary:
 
     milliseconds: Mapping[str, float]
     frames: tuple[Mapping[str, Any], ...]
-    joints: Mapping[int, float]
     pictures: Mapping[int, str]
     warnings: tuple[str, ...]
     unfinished: frozenset[int] = frozenset()
@@ -170,13 +160,16 @@ class _Keys:
     """
 
     def __init__(self, opened: _Opened) -> None:
-        self.opened, self.digests = opened, Digests()
+        self.opened = opened
+        self._recorded: dict[Stamp, str] = {}
         self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
 
     def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
         """Stamps and digests of the files of a frame."""
         if number not in self._inputs:
-            self._inputs[number] = tuple(self.digests.of(path) for path in self.opened.sequence.files(number))
+            self._inputs[number] = tuple(
+                stamp_and_digest(path, self._recorded) for path in self.opened.sequence.files(number)
+            )
         return self._inputs[number]
 
     def key(self, number: int) -> str:
@@ -188,12 +181,12 @@ class _Keys:
             del self._inputs[each]
         return key
 
-    def finished(self, order: Order) -> dict[int, FrameRecord]:
-        """The records of the finished frames: whose results, inputs and settings are still those of the record."""
+    def finished(self, order: Order, numbers: Iterable[int]) -> dict[int, FrameRecord]:
+        """The records of those frames that are finished: whose results, inputs and settings are still the recorded."""
         records = read_records(order.records)
-        self.digests.learn(records.values())
-        numbers = [n for n in self.opened.sequence.numbers if n in records and order.has(records[n])]
-        return {n: records[n] for n in numbers if records[n].key == self.key(n)}
+        self._recorded = dict(each for record in records.values() for each in record.inputs)
+        there = [n for n in numbers if n in records and order.has(records[n])]
+        return {n: records[n] for n in there if records[n].key == self.key(n)}
 
 
 def scan(order: Order) -> Found:
@@ -203,28 +196,21 @@ def scan(order: Order) -> Found:
         InputError: the shot cannot be opened, or cannot be denoised with these settings.
     """
     opened = _opened(order)
-    done = _Keys(opened).finished(order)
-    return Found(
-        opened.shot,
-        tuple(opened.sequence.numbers),
-        frozenset(done),
-        opened.unreadable,
-        opened.overlap,
-        tuple(opened.sequence.warnings),
-    )
+    numbers = tuple(opened.sequence.numbers)
+    done = frozenset(_Keys(opened).finished(order, numbers))
+    return Found(opened.shot, numbers, done, opened.unreadable, opened.overlap)
 
 
-def make(order: Order, piece: Piece, journal: Path) -> Made:
-    """A task: denoise the frames of a piece, and record each as it is finished.
+def make(order: Order, piece: Piece) -> dict[int, str]:
+    """A task: denoise the frames of a piece that are not finished, and record each as it is.
 
     Args:
         order: of the shot.
         piece: the frames.
-        journal: path of a new journal for this attempt.
 
     Returns:
-        The frames that failed. A damaged frame fails alone, and the history begins anew after it; where a result cannot
-        be written, all frames that are left fail.
+        For each failed frame, by number, the reason. A damaged frame fails alone, and the history begins anew after it;
+        where a result cannot be written, all frames that are left fail.
 
     Raises:
         InputError: as :func:`scan`.
@@ -234,34 +220,33 @@ def make(order: Order, piece: Piece, journal: Path) -> Made:
     check_apart(opened.sequence, order.folder)
     # That file says that the shot is complete.
     remove(order.folder / "denoise.json")
-    numbers, left, keys = list(piece.numbers), set(piece.wanted), _Keys(opened)
+    left = set(piece.wanted) - _Keys(opened).finished(order, piece.wanted).keys()
     failed: dict[int, str] = {}
     try:
-        with Journal(journal).open() as own:
-            while left:
-                writer = _Writer(order, keys, own, piece.joint, left)
-                try:
-                    writer.write(numbers)
-                except FrameError as error:
-                    numbers = [number for number in numbers if number > error.number]
-                    failed |= {number: str(error) for number in left & {error.number}}
-                    left -= {number for number in left if number <= error.number}
-    except InputError as error:
-        failed |= dict.fromkeys(left, str(error))
-    except Exception as error:  # of a user's model, or for lack of memory
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        return Made(failed | dict.fromkeys(left, reason[:500]), traceback.format_exc())
-    return Made(failed)
+        with Journal.open(order.records / f"{order.run}{secrets.token_hex(8)}.jsonl") as journal:
+            # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
+            for part in cut(piece.numbers, left, 0, opened.overlap):
+                numbers, keys = list(part.numbers), _Keys(opened)
+                while left & set(numbers):
+                    try:
+                        _Writer(order, keys, journal, left).write(numbers)
+                    except FrameError as error:
+                        numbers = [number for number in numbers if number > error.number]
+                        failed |= {number: str(error) for number in left & {error.number}}
+                        left -= {error.number}
+    except Exception as error:  # also of a user's model, or for lack of memory
+        failed |= dict.fromkeys(left, describe_error(error))
+    return failed
 
 
 def summarize(order: Order) -> Summary:
-    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview, and measure its joints.
+    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview.
 
     Raises:
         InputError: as :func:`scan`, or something cannot be written.
     """
     opened = _opened(order)
-    found = _Keys(opened).finished(order)
+    found = _Keys(opened).finished(order, opened.sequence.numbers)
     records = list(found.values())
     report = new_report(opened.sequence, _name(opened.shot), opened.shot.picked)
     report.frames = {each.number: each.report for each in records}
@@ -274,19 +259,11 @@ def summarize(order: Order) -> Summary:
         write_report(opened.sequence, order.folder, opened.denoiser, report)
         if opened.shot.settings.preview:
             _preview(order, opened, report.files)
-    joints = _joints(order, records, opened.sequence.window)
     described = _described(records)
-    warnings = [*opened.sequence.warnings, *report.warnings] if records else list(opened.sequence.warnings)
-    for number, difference in joints.items():
-        if difference > order.joint:
-            warnings.append(
-                f"joint: the result of frame {number} differs by {difference:.2g} from that with a shorter history, "
-                f"more than {order.joint:g}; make --piece longer, or 0 to cut nothing"
-            )
+    warnings = [*opened.sequence.warnings, *(report.warnings if records else [])]
     return Summary(
         report.milliseconds if records else {},
         tuple(described),
-        joints,
         _pictures(order, records, described),
         tuple(warnings),
         unfinished,
@@ -296,8 +273,8 @@ def summarize(order: Order) -> Summary:
 class _Writer:
     """Denoises frames, and records each as it is finished."""
 
-    def __init__(self, order: Order, keys: _Keys, journal: Journal, joint: int | None, left: set[int]) -> None:
-        self.order, self.keys, self.journal, self.joint, self.left = order, keys, journal, joint, left
+    def __init__(self, order: Order, keys: _Keys, journal: Journal, left: set[int]) -> None:
+        self.order, self.keys, self.journal, self.left = order, keys, journal, left
         self.opened = keys.opened
         self.report = new_report(self.opened.sequence, "")
         self.small: Tensor | None = None
@@ -321,8 +298,6 @@ class _Writer:
     def finished(self, number: int, image: Tensor) -> None:
         """Record a frame; called in the thread that has written its file."""
         before, self.small = self.small, _small(image)
-        if number == self.joint:
-            self._keep_joint(number, image)
         report = self.report.frames.pop(number)
         if number not in self.left:
             return
@@ -338,11 +313,6 @@ class _Writer:
         )
         self.journal.add(record)
         self.left.discard(number)
-
-    def _keep_joint(self, number: int, image: Tensor) -> None:
-        """Keep the result before the joint, for :func:`summarize` to compare with that of the other piece."""
-        pixels = image[0].permute(1, 2, 0).float().cpu().numpy()
-        write_exr(_joint_path(self.order, number), pixels, ["R", "G", "B"], full_float=True)
 
 
 @functools.lru_cache(1)
@@ -433,27 +403,6 @@ def _difference(one: Tensor, other: Tensor) -> float | None:
     if one.shape != other.shape:
         return None
     return float((one - other).abs().mean() / (one.mean() + other.mean()).clamp_min(1e-6))
-
-
-def _joint_path(order: Order, number: int) -> Path:
-    return order.records / f"joint{number}.exr"
-
-
-def _joints(order: Order, records: Collection[FrameRecord], window: Window | None) -> dict[int, float]:
-    """The SMAPE between the two results of the frame before each joint."""
-    found = {}
-    for record in records:
-        path = _joint_path(order, record.number)
-        if not path.is_file():
-            continue
-        try:
-            shown = open_result(order.result(record)).read(window)[0]
-            other = torch.from_numpy(np.ascontiguousarray(read_exr(path)[0][..., :3])).permute(2, 0, 1)[None]
-        except InputError:
-            continue
-        if shown.shape == other.shape:
-            found[record.number] = float(smape_linear(shown, other))
-    return found
 
 
 def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:

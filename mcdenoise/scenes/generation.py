@@ -23,14 +23,11 @@ class Generation:
         out: folder of the sequences; finished frames in it are kept.
         rendering: arguments of :func:`mcdenoise.scenes.render.render_sequence`.
         frames: of each sequence.
-        zoom: see :func:`mcdenoise.scenes.random.random_scene`.
-        noise_seed: of the noise of all scenes; ``None`` takes the seed of the scene.
         wild: whether scenes are shiny, and samples drawn; see :func:`mcdenoise.scenes.random.takes.random_takes`.
         sampling: see :func:`mcdenoise.scenes.random.takes.random_takes`.
         stills: fraction of the seeds that give stills.
         cycles: whether Cycles renders them, else Mitsuba.
         cycles_spp: samples a pixel of Cycles; ``None`` draws them.
-        blender_python: see :class:`mcdenoise.scenes.cycles.Blender`.
         parts: whether Cycles writes diffuse and specular light, too.
         threads: of Cycles; 0 for all processors.
     """
@@ -38,14 +35,11 @@ class Generation:
     out: Path
     rendering: Mapping[str, Any]
     frames: int
-    zoom: float
-    noise_seed: int | None
     wild: bool
     sampling: Sampling
     stills: float
     cycles: bool
     cycles_spp: int | None
-    blender_python: Path | None
     parts: bool
     threads: int
 
@@ -69,28 +63,26 @@ class Generation:
         takes = random_takes(
             seed,
             self.frames,
-            self.zoom,
             sampling=self.sampling,
             spp=None if self.wild else self.rendering["spp"],
             stills=self.stills,
             shiny=self.wild,
             width=max(self.rendering["size"][0], 1),
         )
-        noise = seed if self.noise_seed is None else self.noise_seed
         for take in takes:
             progress = begin(take.name)
             if blender is None:
-                yield self._by_mitsuba(take, noise, progress)
+                yield self._by_mitsuba(take, seed, progress)
             else:
-                yield self._by_cycles(take, noise, blender, progress)
+                yield self._by_cycles(take, seed, blender, progress)
 
-    def _by_cycles(self, take: Take, noise: int, blender: Blender, progress: _Progress) -> Path:
+    def _by_cycles(self, take: Take, seed: int, blender: Blender, progress: _Progress) -> Path:
         return render_cycles(
             take.made,
             self.out / take.name,
             blender,
             size=self.rendering["size"],
-            seed=noise,
+            seed=seed,
             view=take.view,
             samples=self.cycles_spp,
             noise_seeds=self.rendering["noise_seeds"],
@@ -100,13 +92,13 @@ class Generation:
             progress=progress,
         )
 
-    def _by_mitsuba(self, take: Take, noise: int, progress: _Progress) -> Path:
+    def _by_mitsuba(self, take: Take, seed: int, progress: _Progress) -> Path:
         reference_spp = max(self.rendering["reference_spp"], CLEANER * take.spp if self.wild else 0)
         return render_sequence(
             take.made.scene,
             take.made.cameras,
             self.out / take.name,
-            seed=noise,
+            seed=seed,
             moves=take.made.moves,
             film=take.film,
             progress=progress,
@@ -121,7 +113,7 @@ def render_seed(generation: Generation, seed: int) -> list[Path]:
         InputError: see :meth:`Generation.render`; or Blender is missing.
     """
     with ExitStack() as stack:
-        blender = stack.enter_context(Blender(generation.blender_python)) if generation.cycles else None
+        blender = stack.enter_context(Blender()) if generation.cycles else None
         return list(generation.render(seed, blender))
 
 

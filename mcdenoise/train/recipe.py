@@ -45,7 +45,7 @@ _OWN: dict[str, type] = {_CLEAN: bool, "folder": str}
 _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "threads")
 # A file names neither a program to run, nor a machine to connect to, nor a place outside of the data.
-_OF_CALLERS = {"ray", "blender_python", "assets"}
+_OF_CALLERS = {"workers", "assets"}
 # Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
 _FIRST_NAMES = {"noise_seeds": "realisations"}
 

@@ -160,14 +160,13 @@ COMMANDS = {
     "evaluate": Command("evaluate shot out", ("shot", "out"), printed),
     "evaluate model": Command("evaluate shot --model noisy", ("shot",), printed),
     "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
-    "report": Command("report results", ("results",), page),
-    "models": Command("models --results results", ("results",), printed),
+    "report": Command("benchmark -o results", ("results",), page),
     "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
     "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
     # If methods fail, the benchmark lists the reasons and ends with status 1.
     "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
     "export": Command(
-        f"export {MODEL} --weights weights.safetensors -o model.pt2", ("weights.safetensors",), exported, seconds=600
+        f"export {MODEL}(weights=weights.safetensors) -o model.pt2", ("weights.safetensors",), exported, seconds=600
     ),
     "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
     "reader sequence": Command("reader sequence shot", ("shot",), printed),
@@ -403,7 +402,7 @@ KINDS = {
     "recipe": Kind("recipe.toml", toml, {"reader recipe": 200}),
     "film": Kind("film.toml", toml, {"reader film": 200, "film": 20}),
     "camera path": Kind("path.json", json.loads, {"reader camera_path": 200}),
-    "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "models": 10, "report": 10}),
+    "results.json": Kind("results/results.json", json.loads, {"reader results": 160, "report": 10}),
     "earlier denoise.json": Kind("out/denoise.json", exactly, {"denoise again": 100}),
     "earlier image": Kind("out/denoised1.exr", exactly, {"denoise again": 60}),
     "journal of a film": Kind("filmed/.film/wall/*.jsonl", exactly, {"film again": 30}),

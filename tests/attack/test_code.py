@@ -100,7 +100,7 @@ def test_a_recipe_and_a_manifest_name_no_code(
         assert not (here / "out").exists()
 
 
-@pytest.mark.parametrize("key", ["blender_python", "ray"])
+@pytest.mark.parametrize("key", ["blender_python", "workers"])
 def test_a_recipe_names_no_program_and_no_machine(key: str, here: Path, run: Callable[[str], tuple[int, str]]) -> None:
     (here / "recipe.toml").write_text(f'[train]\nsteps = 1\n[[data]]\nseeds = "0"\n{key} = "/bin/true"\n')
     status, said = run("train --recipe recipe.toml -o out")

@@ -65,7 +65,7 @@ def test_generate(cluster: Any, tmp_path: Path) -> None:
     options = ["--seeds", "0-3", "--frames", "3", "--reference-spp", "64", "--noise-seeds", "1", *SMALL]
     assert not run("generate", "-o", tmp_path / "quiet", *options)
     lost = lose(cluster, tmp_path / "out", "*/inputs/color0.exr")
-    assert not run("generate", "-o", tmp_path / "out", *options, "--ray", cluster[0].address)
+    assert not run("generate", "-o", tmp_path / "out", *options, "--workers", cluster[0].address)
     lost.join(60)
     assert not lost.is_alive()
     assert same(tmp_path / "quiet", tmp_path / "out")
@@ -82,7 +82,7 @@ def test_render(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     options = ["scene.xml", "--camera-path", "path.json", "--reference-spp", "64", *SMALL]
     assert not run("render", *options, "-o", "quiet")
     lost = lose(cluster, tmp_path / "out", "inputs/color0.exr")
-    assert not run("render", *options, "-o", "out", "--ray", cluster[0].address)
+    assert not run("render", *options, "-o", "out", "--workers", cluster[0].address)
     lost.join(60)
     assert same(tmp_path / "quiet", tmp_path / "out")
     both = [json.loads((tmp_path / name / "inputs/camera.json").read_text()) for name in ("quiet", "out")]

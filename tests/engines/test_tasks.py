@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from calls import die_at_first, fail, fail_strangely, mark
 
-from mcdenoise.engines import MOST_LOSSES, Done, LocalEngine, Task, cluster, run_tasks
+from mcdenoise import engines
+from mcdenoise.engines import MOST_LOSSES, Done, Engine, LocalEngine, RayEngine, Task, open_engine, run_tasks
 from mcdenoise.errors import InputError
 
 
@@ -22,36 +23,100 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=":")
 
 
+class Run:
+    """Tasks with names, and what came of them."""
+
+    def __init__(self) -> None:
+        self.answers: dict[str, object] = {}
+        self.failed: dict[str, str] = {}
+        self.tasks: list[Task] = []
+
+    def add(
+        self, name: str, function: object, *arguments: object, then: tuple[Task, ...] = (), **options: object
+    ) -> None:
+        def done(answer: object) -> tuple[Task, ...]:
+            self.answers[name] = answer
+            return then
+
+        def failed(reason: str) -> tuple[Task, ...]:
+            self.failed[name] = reason
+            return ()
+
+        self.tasks.append(Task(function, arguments, done, failed, **options))  # type: ignore[arg-type]
+
+    def on(self, engine: Engine) -> Run:
+        run_tasks(engine, self.tasks)
+        return self
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="processes kill themselves by a signal")
 def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> None:
-    answers: dict[str, str] = {}
-    losses = {"lost": 1, "advancing": MOST_LOSSES + 1, "hopeless": MOST_LOSSES}
-
-    def task(name: str) -> Task:
-        # One advances with each attempt, so that it may lose more workers than others.
-        advances = (lambda: len(list(tmp_path.glob("advancing.try*")))) if name == "advancing" else lambda: None
-        return Task(name, die_at_first, (tmp_path, name, losses[name]), advances)
-
-    tasks = [Task("quiet", mark, (tmp_path, "quiet")), Task("failing", fail, ("two\nlines",)), *map(task, losses)]
-    failed = run_tasks(LocalEngine(2), tasks, lambda task, answer: answers.update({task.name: answer}))
-    assert failed == {
+    run, follow = Run(), Run()
+    follow.add("next", mark, tmp_path, "next")
+    run.add("quiet", mark, tmp_path, "quiet", then=tuple(follow.tasks))
+    run.add("failing", fail, "two\nlines")
+    run.add("strange", fail_strangely)
+    run.add("exits", sys.exit, 0)
+    run.add("lost", die_at_first, tmp_path, "lost", 1)
+    run.add("hopeless", die_at_first, tmp_path, "hopeless", MOST_LOSSES)
+    # This one advances with each attempt, so that it may lose more workers than others.
+    advances = {"progress": lambda: len(list(tmp_path.glob("advancing.try*")))}
+    run.add("advancing", die_at_first, tmp_path, "advancing", MOST_LOSSES + 1, **advances)
+    run.on(LocalEngine(2))
+    assert run.failed.pop("hopeless").endswith(f"{MOST_LOSSES} times in a row")
+    assert run.failed == {
         "failing": "RuntimeError: two lines",
-        "hopeless": f"its process ended without a word, perhaps for lack of memory, {MOST_LOSSES} times in a row",
+        "strange": "Strange: 7 and 8",
+        "exits": "SystemExit: 0",
     }
-    assert answers == {name: name for name in ("quiet", "lost", "advancing")}
+    assert set(run.answers) == {"quiet", "lost", "advancing"}
+    assert set(follow.answers) == {"next"}
     # Nobody tries more often than that.
     assert not (tmp_path / "hopeless").exists()
 
 
-def test_no_workers_are_refused() -> None:
-    with pytest.raises(InputError, match=r"--workers: .*0"):
-        LocalEngine(0)
+def test_tasks_start_by_rank() -> None:
+    class Inline:
+        def __init__(self) -> None:
+            self.started: list[object] = []
+            self.done: dict[Hashable, Done] = {}
+
+        def free_slots(self) -> int:
+            return 1
+
+        def submit(self, function: object, *arguments: object) -> Hashable:
+            self.started.append(arguments[0])
+            self.done[len(self.started)] = Done(0)
+            return len(self.started)
+
+        def finished(self, seconds: float) -> dict[Hashable, Done]:
+            found, self.done = self.done, {}
+            return found
+
+        def close(self) -> None:
+            self.started.append("closed")
+
+    run, last, engine = Run(), Run(), Inline()
+    last.add("first", len, "first", rank=0)
+    run.add("a", len, "a", rank=2)
+    run.add("b", len, "b", rank=1, then=tuple(last.tasks))
+    run.on(engine)
+    assert engine.started == ["b", "first", "a", "closed"]
+
+
+def test_workers_are_a_number_or_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(open_engine("2"), LocalEngine)
+    with pytest.raises(InputError, match=r"--workers.*0"):
+        open_engine("0")
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"auto.*mcdenoise\[ray\]"):
+        RayEngine("auto")
 
 
 def test_a_driver_of_another_version_is_refused() -> None:
-    assert cluster._call(version("mcdenoise"), len, "four") == 4
-    with pytest.raises(InputError, match=r"expected version 9\.9, as the driver has, found"):
-        cluster._call("9.9", len, "four")
+    assert engines._call(version("mcdenoise"), len, "four") == 4
+    with pytest.raises(InputError, match=r"9\.9"):
+        engines._call("9.9", len, "four")
 
 
 def kill_children() -> int:
@@ -77,15 +142,9 @@ def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
                 return found
             return super().finished(seconds)
 
-    names = {f"{number}" for number in range(8)}
-    tasks = [Task(name, mark, (tmp_path, name)) for name in sorted(names)]
-    assert run_tasks(Attacked(2), tasks) == {}
+    run, names = Run(), [f"{number}" for number in range(6)]
+    for name in names:
+        run.add(name, mark, tmp_path, name)
+    assert run.on(Attacked(2)).failed == {}
     assert min(killed) >= 1
-    assert {path.name for path in tmp_path.iterdir()} == names
-
-
-def test_errors_that_cannot_be_sent_are_told() -> None:
-    assert run_tasks(LocalEngine(1), [Task("own", fail_strangely), Task("exits", sys.exit, (0,))]) == {
-        "own": "Strange: 7 and 8",
-        "exits": "SystemExit: 0",
-    }
+    assert sorted(path.name for path in tmp_path.iterdir()) == names

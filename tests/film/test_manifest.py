@@ -78,6 +78,8 @@ def test_a_pattern_names_shots_by_what_it_leaves_open(tmp_path: Path) -> None:
     assert shots[2].inputs == (tmp_path / "s2/010/beauty",)
     assert {shot.settings.model for shot in shots} == {"noisy"}
     assert [shot.name for shot in read_film(tmp_path / "s1")] == ["s1"]
+    (first, *_) = read_film(write(tmp_path, 'shots = "s*/0*/beauty"\n[every]\nalpha_min = 0.5\n'))
+    assert (first.name, first.inputs, first.settings.alpha_min) == ("s1_010", (tmp_path / "s1/010/beauty",), 0.5)
 
 
 SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
@@ -86,33 +88,23 @@ SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "expected a table [[shot]] for each shot, found none"),
         ("[shot]\nname = 'a'", "expected a table [[shot]] for each shot, found none"),
-        ("shot = 3", "expected a table [[shot]] for each shot, found none"),
         ("[[shot]\n", "expected TOML, found: "),
-        ("\x00", "expected TOML, found: "),
         (SHOT + "[shots]\n", "expected tables [[shot]] and perhaps [every], found 'shots'"),
         ("every = 1\n" + SHOT, "expected 'every' to be a table, found 1"),
         ('[[shot]]\ninput = "b"', "shot 1: expected 'name', a text, found nothing"),
-        ('[[shot]]\nname = 7\ninput = "b"', "shot 1: expected 'name', a text, found 7"),
         ('[[shot]]\nname = "a"', "shot 1 'a': expected 'input'"),
-        ('[[shot]]\nname = "a"\ninput = []', "shot 1 'a': expected 'input'"),
         ('[[shot]]\nname = "a"\ninput = [1]', "expected 'input', a folder, file or pattern or a list of these"),
         ('[[shot]]\nname = "../a"\ninput = "b"', "expected a name that a folder can have"),
-        ('[[shot]]\nname = ".film"\ninput = "b"', "expected a name that a folder can have"),
         ('[[shot]]\nname = "film.json"\ninput = "b"', "not one of film.html, film.json"),
-        ('[[shot]]\nname = ""\ninput = "b"', "expected a name that a folder can have"),
         (f'[[shot]]\nname = "{"a" * 300}"\ninput = "b"', "expected a name that a folder can have"),
         (SHOT + SHOT.replace('"a"', '"A"'), "expected a name of its own for each shot, found 'A' twice"),
         (SHOT + "modle = 'x'", "found 'modle'; did you mean 'model'?"),
         (SHOT + "out = 'x'", "expected a setting of `mcdenoise denoise`, found 'out'"),
         (SHOT + "alpha_min = 'small'", "shot 1 'a', alpha_min: expected a number, found 'small'"),
         (SHOT + "alpha_min = 2.0", "shot 1 'a': --alpha-min: expected in (0, 1], found 2.0"),
-        (SHOT + "tile = 64.5", "tile: expected a whole number, found 64.5"),
         (SHOT + "tile = true", "tile: expected a whole number, found True"),
         (SHOT + "alpha = 1", "alpha: expected true or false, found 1"),
-        (SHOT + "model = 3", "model: expected a text, found 3"),
-        (SHOT + "weights = 3", "weights: expected a path, found 3"),
         (SHOT + "precision = 'exact'", "precision: expected one of auto, float32, bfloat16, found 'exact'"),
         (SHOT + "map = [1]", "map: expected a text or a list of texts, found [1]"),
         (SHOT + "frames = '3-1'", "shot 1 'a': frames: expected numbers and ascending ranges"),
@@ -155,17 +147,9 @@ def test_a_pattern_that_matches_nothing(tmp_path: Path) -> None:
         read_film(tmp_path / "x*")
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--piece", "-1"], "--piece: expected at least 0 frames, found -1"),
-        (["--joint", "1"], "--joint: expected a fraction between 0 and 1, found 1"),
-        (["--workers", "0"], "--workers: expected at least 1, found 0"),
-        (["--workers", "2", "--ray", "auto"], "--workers, --ray: expected one of them, found both"),
-    ],
-)
-def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str) -> None:
+@pytest.mark.parametrize("options", [["--piece", "-1"], ["--workers", "0"]], ids=" ".join)
+def test_bad_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["film", str(write(tmp_path, SHOT)), "-o", str(tmp_path / "out"), *options])
     assert stop.value.code == 2
-    assert expected in capsys.readouterr().err
+    assert f"{options[0]}: " in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Ten thousand frames through one process: memory stays what it is."""
+"""Thousands of frames through one process: memory stays what it is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcdenoise.film.record import FrameRecord, Journal, read_records
 from mcdenoise.film.work import Order, make, scan
 from mcdenoise.shot import ShotSettings
 
-FRAMES, DIFFERENT = 10_000, 50
+FRAMES, DIFFERENT = 4_000, 50
 
 
 def resident() -> int:
@@ -27,7 +27,7 @@ def resident() -> int:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is told by /proc")
-def test_memory_is_flat_over_ten_thousand_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_is_flat_over_thousands_of_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = write_shot(tmp_path / "shot", DIFFERENT, width=64, height=40) / "inputs"
     (inputs / "camera_matrices.h").unlink()
     for number in range(DIFFERENT, FRAMES):
@@ -50,7 +50,7 @@ def test_memory_is_flat_over_ten_thousand_frames(tmp_path: Path, monkeypatch: py
     found = scan(order)
     assert len(found.numbers) == FRAMES
     (piece,) = cut(found.numbers, found.numbers, 0, found.overlap)
-    assert not make(order, piece, order.records / "all.jsonl").failed
+    assert not make(order, piece)
     assert len(read_records(order.records)) == FRAMES
     early, late = measured.values()
     print(f"{early / 1e6:.1f} MB after {FRAMES // 5} frames, {late / 1e6:.1f} MB after {FRAMES}")

@@ -18,7 +18,7 @@ from mcdenoise.film import Film, read_film, run_film
 ray = pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
 # The warnings are Ray's own; none is of this package.
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.timeout(900)]
-FRAMES = 12
+FRAMES = 8
 
 
 @pytest.fixture

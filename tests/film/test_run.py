@@ -15,10 +15,9 @@ from shots import Inline, edit, pixels, same, write_manifest, write_shot
 
 from mcdenoise.cli import main
 from mcdenoise.data.files import held
-from mcdenoise.engines import RayEngine
 from mcdenoise.errors import InputError
 from mcdenoise.film import Film, FilmResult, read_film, run_film, write_page
-from mcdenoise.film.record import FrameRecord, read_records
+from mcdenoise.film.record import read_records
 from mcdenoise.shot import ShotSettings
 
 MODEL = "accumulated"
@@ -129,22 +128,6 @@ def test_other_settings_make_all_anew_and_silent_ones_nothing(shots: dict[str, P
     assert run(shots, tmp_path / "out", model="noisy").made == 9
 
 
-def test_a_film_that_was_stopped_goes_on(shots: dict[str, Path], tmp_path: Path) -> None:
-    run(shots, tmp_path / "whole")
-    # The film is left as if it had been killed after three frames.
-    records = sorted(read_records(tmp_path / "whole/.film/s1").values(), key=lambda each: each.number)
-    run({"s1": shots["s1"]}, tmp_path / "out")
-    for path in (tmp_path / "out/.film/s1").glob("*.jsonl"):
-        own = [FrameRecord.of(line) for line in path.read_text().splitlines() if '"number"' in line]
-        path.write_text("\n".join(each.line() for each in own[:3] if each is not None) + "\n{")
-    for number in (3, 4):
-        (tmp_path / f"out/s1/denoised{number}.exr").unlink()
-    assert len(records) == 5
-    result = run({"s1": shots["s1"]}, tmp_path / "out")
-    assert (result.made, result.complete) == (2, True)
-    assert same(tmp_path / "out/s1", tmp_path / "whole/s1")
-
-
 def test_lost_tasks_are_done_again_and_again_but_not_for_ever(shots: dict[str, Path], tmp_path: Path) -> None:
     quiet = run(shots, tmp_path / "quiet")
     engine = Inline(lambda task, count: count % 3 == 0)
@@ -158,12 +141,8 @@ def test_lost_tasks_are_done_again_and_again_but_not_for_ever(shots: dict[str, P
 
 @pytest.mark.parametrize(
     "damage",
-    [
-        lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(b"no image at all"),
-    ],
-    ids=["cut off", "empty", "another"],
+    [lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), lambda path: path.write_bytes(b"")],
+    ids=["cut off", "empty"],
 )
 def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, damage: Callable[[Path], object]) -> None:
     path = shots["s1"] / "inputs/color2.exr"
@@ -187,7 +166,7 @@ def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, dam
 def test_the_table_of_what_failed_and_status_1(
     shots: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mcdenoise.cli.film.LocalEngine", lambda workers: Inline())
+    monkeypatch.setattr("mcdenoise.cli.film.open_engine", lambda workers, **options: Inline())
     (shots["s1"] / "inputs/color2.exr").write_bytes(b"")
     manifest = write_manifest(tmp_path / "film.toml", {**shots, "gone": tmp_path / "nowhere"}, model=MODEL)
     with pytest.raises(SystemExit) as stop:
@@ -235,7 +214,6 @@ def test_a_model_that_fails_is_no_fault_of_the_film(shots: dict[str, Path], tmp_
     settings = ShotSettings(f"{tmp_path}/mine.py:make")
     result = run_film(Film(read_film(manifest, settings), tmp_path / "out"), Inline())
     assert result.shots[0].failures() == [("0 to 3 (4)", "ArithmeticError: no way")]
-    assert "mine.py" in result.shots[0].traces[0]
 
 
 def test_two_films_in_one_folder(shots: dict[str, Path], tmp_path: Path) -> None:
@@ -246,23 +224,3 @@ def test_two_films_in_one_folder(shots: dict[str, Path], tmp_path: Path) -> None
     ):
         run(shots, tmp_path / "out")
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".film"]
-
-
-def test_names_of_any_kind(tmp_path: Path) -> None:
-    names = ("a b", "ä\n\u202e", "[x]", "--", "é" * 60)
-    shots = {name: write_shot(tmp_path / f"in{i}", 2) for i, name in enumerate(names)}
-    lines = "".join(
-        f"[[shot]]\nname = {json.dumps(name)}\ninput = {json.dumps(str(path))}\n" for name, path in shots.items()
-    )
-    (tmp_path / "film.toml").write_text(lines)
-    film = Film(read_film(tmp_path / "film.toml", ShotSettings("noisy")), tmp_path / "out")
-    result = run_film(film, Inline())
-    assert result.complete
-    write_page(film, result)
-    assert all(len(pixels(tmp_path / "out" / name)) == 2 for name in names)
-
-
-def test_without_ray_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "ray", None)
-    with pytest.raises(InputError, match=r"--ray: expected the package ray, which is not installed; pip install"):
-        RayEngine("auto")

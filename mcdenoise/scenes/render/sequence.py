@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
-from mcdenoise.engines import Engine
+from mcdenoise.engines import Engine, LocalEngine
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
-from mcdenoise.scenes.render.processes import TracerSource, render_in_processes
-from mcdenoise.scenes.render.remote import render_on_engine
+from mcdenoise.scenes.render.tasks import TracerSource, render_on_engine
 from mcdenoise.scenes.render.tracer import (
     RR_DEPTH,
     STRATIFIED_PATHS,
@@ -92,7 +91,8 @@ def render_sequence(
         keep_samples: also write the single paths of each noisy colour, as layers of ``samplesN.exr``; on a film with
             the features of each path.
         engine: renders the frames instead of processes of this machine, such as a
-            :class:`mcdenoise.engines.RayEngine`; it is closed at the end. Progress then advances frame by frame.
+            :class:`mcdenoise.engines.RayEngine`; it is closed at the end. With it, or with workers, progress advances
+            frame by frame.
         progress: called with the finished and the total number of paths per pixel, summed over all frames. A reference
             that reaches the noise level early counts as complete.
 
@@ -101,7 +101,7 @@ def render_sequence(
 
     Raises:
         InputError: Mitsuba is missing, the scene cannot be loaded, a setting is invalid, a moving object does not
-            exist, a worker process died, or ``out`` cannot be written or holds a sequence with other settings.
+            exist, a frame failed, or ``out`` cannot be written or holds a sequence with other settings.
     """
     width, height = size
     cameras = list(cameras)
@@ -118,7 +118,9 @@ def render_sequence(
         workers=(workers, 1),
     )
     source = TracerSource(scene, choose_variant(variant), max_depth, checked_moves)
-    if workers > 1 or engine is not None:
+    if workers > 1 and engine is None:
+        engine = LocalEngine(workers)
+    if engine is not None:
         source.check_portable()
     tracer = source.tracer()
     reach = tracer.reach(cameras)
@@ -194,13 +196,11 @@ def render_sequence(
                 folder.note_reference(number, state)
 
         render_on_engine(source, job, missing, engine, finish)
-    elif workers == 1:
+    else:
         for number in missing:
             state = render_frame(job, tracer, number, advance)
             if state is not None:
                 folder.note_reference(number, state)
-    else:
-        render_in_processes(source, job, missing, workers, advance, folder.note_reference)
     return folder.path
 
 
