@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
-import inspect
 import json
 import os
 import re
@@ -20,14 +18,10 @@ import pytest
 import torch
 
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.cli import COMMANDS, load_command, main
-from mcdenoise.cli.render import RenderOptions
+from mcdenoise.cli import COMMANDS, main
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.models import compared_models, create_model, list_models, overview, pretrained_models, save_weights
-from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
-from mcdenoise.shot import ShotSettings
-from mcdenoise.train import TrainConfig
+from mcdenoise.models import compared_models, create_model, list_models, pretrained_models, save_weights
 
 RGB = ["R", "G", "B"]
 POSITIONAL = {"folder", "inputs", "sequence", "sequences", "scene", "images", "ops", "manifest"}
@@ -114,32 +108,20 @@ def whole_images(folder: Path) -> list[str]:
 # Help
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_names_every_option(run: Callable[..., tuple[int, str, str]], command: str) -> None:
-    status, text, errors = run(command, "--help")
-    assert (status, errors) == (0, "")
-    parameters = inspect.signature(load_command(command)).parameters
-    names = set(parameters) - POSITIONAL - {"export": {"model"}}.get(command, set())
-    for group, settings in (("config", TrainConfig), ("rendering", RenderOptions), ("shot", ShotSettings)):
-        if group in names:
-            names = names - {group} | {field.name for field in dataclasses.fields(settings)}
-    for name in names:
-        assert f"--{name.replace('_', '-')}" in text, name
-    if "out" in names:
-        assert "-o PATH" in text
-    # Every option has a description.
-    assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text)
+LIMITS = {"commands": 14, "options": 154}
 
 
-@pytest.mark.parametrize("command", ["denoise", "inspect"])
-def test_help_on_the_frames_of_a_shot(run: Callable[..., tuple[int, str, str]], command: str) -> None:
-    text = run(command, "--help")[1]
-    assert text.startswith(f"usage: mcdenoise {command} [-h] [OPTIONS] INPUT [INPUT ...]\n")
-    assert "(default: )" not in text
-    assert "--map BUFFER=LAYER" in text
-    assert "--color-without-albedo " in text
-    assert "--no-color" not in text
-    assert ("'shot_%04d.exr'" in text) is (command == "denoise")
+def test_help_is_complete_short_and_plain(run: Callable[..., tuple[int, str, str]]) -> None:
+    """Every option has a description, none has markup of the source, and they stay few enough to be read."""
+    options = 0
+    for command in COMMANDS:
+        status, text, errors = run(command, "--help")
+        assert (status, errors) == (0, "")
+        assert not re.search(r":[a-z]+:|``|\{None\}", text), command
+        assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text), command
+        options += len(set(re.findall(r"^│ (?:-\w(?: \w+)?, )?(--[a-z-]+)", text, re.MULTILINE)) - {"--help"})
+    assert len(COMMANDS) <= LIMITS["commands"]
+    assert options <= LIMITS["options"]
 
 
 def test_summary_and_version(run: Callable[..., tuple[int, str, str]]) -> None:
@@ -169,14 +151,9 @@ def test_unknown_command(refused: Callable[..., str]) -> None:
             ["denoise", "somewhere", "--ot", "out"],
             "expected --out PATH, found none; unrecognized options: --ot out; see",
         ),
-        (["render"], ": expected SCENE, --camera-path PATH, --out PATH, found none; see"),
         (["evaluate"], ": expected SEQUENCE, found none; see"),
-        (["denoise", "somewhere", "-o", "out", "--colour"], "--colour"),
         (["denoise", "somewhere", "-o", "out", "--threads", "many"], "--threads"),
-        (["denoise", "somewhere", "-o", "out", "--alpha-min", "small"], "--alpha-min"),
-        (["evaluate", "somewhere", "elsewhere", "nowhere"], "nowhere"),
         (["models", "--json"], "--json"),
-        (["train", "somewhere", "-o", "out", "--precision", "exact"], "--precision"),
     ],
     ids=" ".join,
 )
@@ -203,12 +180,8 @@ def test_bad_usage(
     ("option", "value", "expected"),
     [
         ("--frames", "3-1", "expected numbers and ascending ranges"),
-        ("--frames", "all", "expected numbers and ascending ranges"),
         ("--frames", "2-9", "expected frame 4, found frames 0 to 3"),
         ("--threads", "0", "--threads: expected 1 to 1024, found 0"),
-        ("--threads", "99999", "--threads: expected 1 to 1024, found 99999"),
-        ("--alpha-min", "0", "--alpha-min: expected in (0, 1], found 0.0"),
-        ("--alpha-min", "1.5", "--alpha-min: expected in (0, 1], found 1.5"),
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
         ("--model", "cascaded_v2_tiny", "expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"),
@@ -267,9 +240,7 @@ def test_models_that_are_not_available(refused: Callable[..., str], small_sequen
     ("model", "expected"),
     [
         ("oidn_tund", "model 'oidn_tund': found no model of this name; did you mean oidn_tuned or "),
-        ("OIDN-tuned", "did you mean oidn_tuned or "),
         ("joint_bilateral(sigma_color=1", "expected ')' after the settings, found none; add it"),
-        ("folder/mine.py:blur(radius=2", "expected ')' after the settings, found none; add it"),
     ],
 )
 def test_misspelt_models(
@@ -335,10 +306,7 @@ def test_a_users_model(run: Callable[..., tuple[int, str, str]], small_sequence:
     ("factory", "options", "expected"),
     [
         ("blurred", (), "expected a factory 'blurred' in"),
-        ("blur(radius=)", (), "expected settings such as (setting=value), found 'radius='"),
         ("blur", ("--alpha-min", "0.2"), "got an unexpected keyword argument 'alpha_min'; it takes radius"),
-        ("blur", ("--no-anti-lag",), "got an unexpected keyword argument 'anti_lag'"),
-        ("blur", ("--tolerance", "0"), "got an unexpected keyword argument 'tolerance'"),
         ("blur", ("--tile", "64"), "expected a model that computes tiles"),
         ("nothing", (), "expected a model with `needs`"),
     ],
@@ -360,7 +328,6 @@ def test_a_users_model_that_is_not_available(
     ("factory", "expected"),
     [
         ("infinite", "frame 0: model: expected finite radiance, found 480 NaN or infinite pixels"),
-        ("smaller", "frame 0: model: expected an Output with an image of (1, 3, 20, 24), found an image of"),
         ("demanding", "frame 0: buffer 'roughness': the model needs it"),
     ],
 )
@@ -451,7 +418,7 @@ def test_a_truncated_image_leaves_only_whole_files(
 
 
 @pytest.mark.parametrize(("stem", "buffer"), [("albedo", "albedo"), ("shading_normal", "normal")])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.inf])
 def test_an_invalid_feature_leaves_only_whole_files(
     refused: Callable[..., str],
     denoise: list[Any],
@@ -478,7 +445,7 @@ def test_an_output_path_that_is_taken(refused: Callable[..., str], denoise: list
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["inspect", "--help"]])
+@pytest.mark.parametrize("arguments", [["--version"]])
 def test_a_full_standard_output_is_reported_in_one_line(arguments: list[str]) -> None:
     command = [sys.executable, "-m", "mcdenoise", *arguments]
     with open("/dev/full", "w") as full:
@@ -510,11 +477,6 @@ def test_names_that_the_standard_output_cannot_show(small_sequence: Path, tmp_pa
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert "M\\xfcller, \\u6620\\u753b" in done.stdout
-
-
-def test_json_that_cannot_be_written(refused: Callable[..., str], tmp_path: Path) -> None:
-    path = tmp_path / "nowhere" / "models.json"
-    assert f"{path}: cannot be written" in refused("models", "--json", path)
 
 
 # Successful commands
@@ -562,60 +524,6 @@ def test_warnings_of_the_library_are_lines_of_the_command(small_sequence: Path, 
     assert ".py" not in done.stderr
 
 
-def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    path = tmp_path / "models.json"
-    status, text, errors = run("models", "--json", path)
-    assert (status, errors) == (0, "")
-    entries = json.loads(path.read_text())
-    assert sorted(entry["name"] for entry in entries) == list_models()
-    for entry in entries:
-        parameters = f"{entry['parameters']:,}" if entry["parameters"] else "-"
-        assert re.search(rf"\b{entry['name']} .* {parameters} ", text)
-    assert "SMAPE" not in text
-
-
-def test_models_in_a_narrow_terminal(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setenv("COLUMNS", "80")
-    _, text, _ = run("models")
-    rows = [line.split("│") for line in text.splitlines() if line.startswith("│")]
-    assert [row[1].strip() for row in rows if row[1].strip()] == [entry.name for entry in overview()]
-    assert all(len(row[-2]) > 20 for row in rows)
-    assert "not shown, for lack of width (see --json): kMAC per pixel, paper, parameters, uses" in text
-
-
-def test_models_with_results_of_a_benchmark(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    names = ("cascaded_v2_micro", "noisy", "cascaded_v2_tiny")
-    methods = [Method(name, "fixed", name, name) for name in names]
-    methods.append(Method("other", "fixed", "other", "cascaded_v2_small", weights="mine.safetensors"))
-    cells = [
-        Cell(scene, method.name, {"SMAPE": error}, computing=Spread(ms, ms, ms, 3))
-        for method in methods
-        for scene, error, ms in (("a", 0.04, 100.0), ("b", 0.06, 300.0))
-    ]
-    # One of its scenes is missing.
-    cells.remove(next(cell for cell in cells if cell.method == "cascaded_v2_tiny"))
-    scenes = [Scene(name, 4, 4, [0], [0]) for name in ("a", "b")]
-    Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 1, scenes, methods, cells).write(tmp_path)
-    status, text, _ = run("models", "--results", tmp_path)
-    assert status == 0
-    rows = {
-        cells[1]: cells for line in text.splitlines() if len(cells := [part.strip() for part in line.split("│")]) > 3
-    }
-    assert rows["cascaded_v2_micro"][8:10] == rows["noisy"][8:10] == ["0.0500", "200.0"]
-    assert rows["cascaded_v2_tiny"][8:10] == rows["cascaded_v2_small"][8:10] == ["-", "-"]
-    assert run("models", "--results", tmp_path / "nothing")[0] == 2
-
-
-def test_ops(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    path = tmp_path / "ops.json"
-    status, text, errors = run("ops", "--json", path)
-    assert (status, errors) == (0, "")
-    names = [entry["name"] for entry in json.loads(path.read_text())]
-    assert "kernel_conv" in names
-    assert all(name in text for name in names)
-
-
 @pytest.fixture
 def colors(small_sequence: Path, tmp_path: Path) -> Path:
     """A folder with the noisy colors of the sequence, as the images of another denoiser."""
@@ -646,15 +554,6 @@ def test_evaluate(run: Callable[..., tuple[int, str, str]], small_sequence: Path
     assert "no flicker: " in text
 
 
-def test_evaluate_our_own_result_of_some_frames(
-    run: Callable[..., tuple[int, str, str]], small_sequence: Path, denoise: list[Any], out: Path, tmp_path: Path
-) -> None:
-    assert run(*denoise, "--frames", "1-2")[0] == 0
-    path = tmp_path / "errors.json"
-    assert run("evaluate", small_sequence, out, "--frames", "1-2", "--json", path)[0] == 0
-    assert list(json.loads(path.read_text())["protocols"]["strict"]["frames"]) == ["1", "2"]
-
-
 def test_evaluate_rejects_images_that_cannot_be_compared(
     run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], small_sequence: Path, colors: Path
 ) -> None:
@@ -674,28 +573,6 @@ def test_evaluate_rejects_images_that_cannot_be_compared(
     assert f"found both, {colors} and cascaded_v2; omit one" in refused(*evaluate, "--model", "cascaded_v2")
     assert f"found only the sequence {small_sequence}; name the folder after it, or" in refused(*evaluate[:2])
     assert "no such folder" in refused("evaluate", small_sequence / "nowhere", colors)
-
-
-def test_evaluate_images_smaller_than_a_window(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
-    sequence, result = tmp_path / "tiny", tmp_path / "result"
-    for folder, name in ((sequence, "color"), (sequence, "reference"), (result, "denoised")):
-        folder.mkdir(exist_ok=True)
-        write_exr(folder / f"{name}0.exr", np.full((5, 6, 3), 0.5), RGB)
-    for protocol in ("strict", "meng2020", "fan2021", "noisebase"):
-        status, text, _ = run("evaluate", sequence, result, "--protocol", protocol)
-        assert status == 0
-        assert "strict: no SSIM: SSIM's window: expected at least 11 x 11 pixels, found 5 x 6" in text
-        assert "| inf" in text.replace("│", "|")
-
-
-def test_gradcheck(run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], tmp_path: Path) -> None:
-    path = tmp_path / "gradcheck.json"
-    status, text, errors = run("gradcheck", "demodulate", "--json", path)
-    assert (status, errors) == (0, "")
-    results = json.loads(path.read_text())
-    assert {result["op"] for result in results} == {"demodulate"}
-    assert f"{len(results)} checks, 0 failed" in text
-    assert "cascade_loss" in refused("gradcheck", "cascade_loss")
 
 
 def test_random_weights_are_said(
@@ -719,6 +596,19 @@ def test_random_weights_are_said(
             assert len(re.findall(r"^warning: .*random", errors, re.MULTILINE)) == said
 
 
+def test_models(run: Callable[..., tuple[int, str, str]], tmp_path: Path) -> None:
+    path = tmp_path / "models.json"
+    listed: dict[str, list[str]] = {}
+    for option in ("--json", "--all", "--ops"):
+        status, text, errors = run("models", option, *([] if option == "--json" else ["--json"]), path)
+        assert (status, errors) == (0, "")
+        listed[option] = [entry["name"] for entry in json.loads(path.read_text())]
+        assert all(name in text for name in listed[option])
+    assert sorted(listed["--json"]) == sorted(pretrained_models())
+    assert sorted(listed["--all"]) == list_models()
+    assert "kernel_conv" in listed["--ops"]
+
+
 # Training and rendering
 
 
@@ -737,16 +627,6 @@ def test_train(
     assert run(*denoise, "--weights", weights)[0] == 0
 
 
-def test_train_without_data(refused: Callable[..., str], small_sequence: Path, out: Path) -> None:
-    assert "expected at least one sequence folder, found none" in refused("train", "-o", out)
-    assert "expected a folder, an image, or a pattern such as shot_####.exr, found no such folder" in refused(
-        "train", "nowhere", "-o", out
-    )
-    assert "expected images of at least 128 pixels" in refused("train", small_sequence, "-o", out, "--frames", "2")
-    assert "steps: expected at least 1, found 0" in refused("train", small_sequence, "-o", out, "--steps", "0")
-    assert not out.exists()
-
-
 @pytest.fixture
 def camera_path(tmp_path: Path) -> Path:
     path = tmp_path / "path.json"
@@ -754,23 +634,10 @@ def camera_path(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("size", ["64", "64x", "x", "64x-3", "axb", "1e3x3"])
+@pytest.mark.parametrize("size", ["64x", "64x-3", "axb"])
 def test_render_with_a_bad_size(refused: Callable[..., str], camera_path: Path, out: Path, size: str) -> None:
     message = refused("render", "scene.xml", "--camera-path", camera_path, "-o", out, "--size", size)
     assert f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{size}'" in message
-    assert not out.exists()
-
-
-def test_render_with_bad_paths(refused: Callable[..., str], camera_path: Path, tmp_path: Path, out: Path) -> None:
-    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    scalar = ["-o", out, "--size", "8x8", "--variant", "scalar_rgb"]
-    message = refused("render", tmp_path / "nothing.xml", "--camera-path", camera_path, *scalar)
-    assert "nothing.xml: expected a Mitsuba scene, found no such file" in message
-    scene = tmp_path / "scene.xml"
-    scene.write_text("<scene version='3.0.0'><shape type='teapot'/></scene>")
-    assert f"{scene}: Mitsuba cannot load it" in refused("render", scene, "--camera-path", camera_path, *scalar)
-    assert "nowhere.json" in refused("render", scene, "--camera-path", tmp_path / "nowhere.json", *scalar)
-    assert "0x8" in refused("render", scene, "--camera-path", camera_path, *scalar[:2], "--size", "0x8", *scalar[4:])
     assert not out.exists()
 
 
@@ -825,14 +692,9 @@ def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> N
     ("option", "value", "expected"),
     [
         ("--seeds", "3-1", "--seeds: expected numbers and ascending ranges"),
-        ("--seeds", "-1", "--seeds"),
-        ("--seeds", "all", "--seeds: expected numbers and ascending ranges"),
         ("--frames", "0", "--frames: expected at least 1, found 0"),
-        ("--size", "160", "--size: expected WIDTHxHEIGHT such as 1280x720, found '160'"),
         ("--size", "0x8", "expected width and height between 1 and 16384 pixels, found 0x8"),
-        ("--noise-seeds", "0", "noise_seeds: expected at least 1, found 0"),
         ("--stills", "1.5", "--stills: expected a fraction from 0 to 1, found 1.5"),
-        ("--sampling", "left", "centre"),
     ],
 )
 def test_generate_with_bad_options(
@@ -847,35 +709,17 @@ def test_generate_with_bad_options(
 # Separate processes
 
 
-def test_a_process_denoises(denoise: list[Any], out: Path) -> None:
-    result = process(*denoise)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert (out / "denoised3.exr").is_file()
-
-
 def test_a_process_prints_errors_in_one_line(weights: Path, tmp_path: Path, out: Path) -> None:
     result = process("denoise", tmp_path / "nowhere", "-o", out, "--weights", weights)
     assert (result.returncode, result.stdout) == (2, "")
     assert re.fullmatch(r"mcdenoise denoise: .*nowhere: expected a folder, an image, or a pattern.*\n", result.stderr)
 
 
-def test_the_installed_command_prints_help() -> None:
-    command = Path(sys.executable).parent / "mcdenoise"
-    if not command.exists():
-        pytest.skip("the package's commands are not installed beside this Python")
-    result = subprocess.run([command, "denoise", "--help"], capture_output=True, text=True, check=False, timeout=120)
-    assert (result.returncode, result.stderr) == (0, "")
-    assert "--alpha-min" in result.stdout
-
-
 @pytest.mark.parametrize(
     "command",
     [
-        "inspect {shot}",
         "denoise {shot} -o {tmp}/out",
-        "evaluate {shot} {shot}/inputs",
         "models",
-        "stability no_such_op",
     ],
 )
 @pytest.mark.parametrize("place", ["nowhere/figures.json", "folder", "loop.json"])
@@ -894,7 +738,7 @@ def test_a_json_that_cannot_be_written_is_rejected_before_the_work(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["camera.json", "camera_matrices.h", "color0.exr"])
+@pytest.mark.parametrize("name", ["camera.json", "color0.exr"])
 def test_a_json_that_would_overwrite_an_input_is_rejected(
     small_sequence: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

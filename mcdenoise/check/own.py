@@ -54,7 +54,7 @@ def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
     unknown = [name for name in names if name not in known and ":" not in name and not name.endswith(".py")]
     if unknown:
         if near := did_you_mean(unknown[0], known):
-            raise InputError(f"op: found no {unknown[0]}; {near} `mcdenoise ops` lists all")
+            raise InputError(f"op: found no {unknown[0]}; {near} `mcdenoise models --ops` lists all")
         raise InputError(
             f"op: expected one of {', '.join(known)}, or path/to/file.py:function, or package.module:function, "
             f"found {', '.join(unknown)}"

@@ -15,8 +15,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
+from inspect import cleandoc, signature
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from mcdenoise.cli._stdout import forgiving_stdout
 from mcdenoise.errors import InputError, printable
@@ -36,12 +37,10 @@ COMMANDS = {
     "train": "Train a model on sequences with references.",
     "evaluate": "Compare a folder of denoised images with references.",
     "benchmark": "Measure error and run time of models and other denoisers.",
-    "report": "Write the web page and the plots of a finished benchmark.",
     "gradcheck": "Check first and second derivatives of the operators, or of a function of your own.",
     "stability": "Check operators, models and the denoiser on stiff and extreme inputs, in every precision.",
     "export": "Write a model as an ONNX or torch.export graph.",
-    "models": "List the models with their sizes and costs.",
-    "ops": "List the operators with their errors against their equations in float64.",
+    "models": "List the models, or the operators, with what they need and cost.",
 }
 
 _SUMMARY = """usage: mcdenoise COMMAND [OPTIONS]
@@ -202,19 +201,24 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
     Raises:
         InputError: the command does not accept the arguments.
     """
-    # This import is slow, so it comes after the handling of signals has begun.
+    # These imports are slow, so they come after the handling of signals has begun.
     import tyro
+
+    from mcdenoise.cli._options import optional_values
 
     command, prog = load_command(name), f"mcdenoise {name}"
 
-    @functools.wraps(command)
     def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
         return functools.partial(command, *args, **kwargs)
 
+    bind.__signature__ = signature(command)  # type: ignore[attr-defined]
+    bind.__annotations__ = get_type_hints(command, include_extras=True)
+    # Without the line breaks that are due to the width of the source.
+    bind.__doc__ = re.sub(r"\n {8,}(?=\S)", " ", cleandoc(command.__doc__ or ""))
     messages = io.StringIO()
     try:
         with contextlib.redirect_stderr(messages):
-            return tyro.cli(bind, args=[_expanded(each) for each in arguments], prog=prog)
+            return tyro.cli(bind, args=[_expanded(each) for each in arguments], prog=prog, registry=optional_values())
     except SystemExit as stop:
         if not stop.code:
             raise

@@ -23,6 +23,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import Spelling
 from mcdenoise.report import check_packages, write_report
+from mcdenoise.results import FILE
 from mcdenoise.shot import check_threads
 
 
@@ -53,7 +54,8 @@ def benchmark(
 
     Writes the report OUT/index.html with its plots, results.json, results.csv and images; OUT must be new or empty. The
     exit status is 1 if a method failed on a scene; a method is skipped on scenes that lack a buffer it needs. With
-    --ops, measures the operators instead: run time, error, and run time relative to a copy.
+    --ops, measures the operators instead: run time, error, and run time relative to a copy. With --out of a finished
+    benchmark alone, writes its report again.
 
     With --suite wild, renders the missing frames of a test suite that no training uses, in Mitsuba and in Blender's
     Cycles, to the folder of --data, and compares --models with OIDN's best setting on each row: OUT/suite.md,
@@ -120,7 +122,10 @@ def benchmark(
             data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
         )
     if not ops and not sequences:
-        raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
+        if out is None or not (out / FILE).exists():
+            raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
+        say(f"report: {write_report(out)}")
+        return 0
     rounds = rounds if rounds is not None else 5 if ops else 3
     if ops:
         with progress_bar() as progress:

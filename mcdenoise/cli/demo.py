@@ -8,14 +8,14 @@ from typing import Any
 
 from rich.table import Table
 
-from mcdenoise.cli._options import Json, Out
-from mcdenoise.cli._output import print_times, progress_bar, say, show, write_json
+from mcdenoise.cli._options import Out
+from mcdenoise.cli._output import print_times, progress_bar, say, show
 from mcdenoise.demo import FRAMES, run_demo
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT
 
 
-def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> None:
+def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
     """Render 16 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
     Then compare the error and the run time of a dozen models, filters and installed denoisers in a report.
@@ -23,7 +23,6 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> No
     Args:
         out: folder to write to; frames that an earlier run rendered there are reused.
         model: a name with optional settings, a weights file, or file.py:factory, as for `mcdenoise denoise`.
-        json: write the printed figures to this file too.
     """
     keep_heap()
     with progress_bar() as progress:
@@ -42,7 +41,6 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT, json: Json = None) -> No
     print_times(result.report.milliseconds)
     for what, path in {"clean frames": result.denoised, "picture": result.picture, "report": result.page}.items():
         say(f"{what}: {path}")
-    write_json(json, {"scores": scores, "milliseconds": result.report.milliseconds})
 
 
 def _print_scores(rows: list[dict[str, Any]]) -> None:

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
-from mcdenoise.cli._options import Json, Out
-from mcdenoise.cli._output import say, write_json
+from mcdenoise.cli._options import Out
+from mcdenoise.cli._output import say
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
-from mcdenoise.export import Format, default_buffers, differences, export_model
+from mcdenoise.export import default_buffers, differences, export_model
 from mcdenoise.methods import parse_method
 from mcdenoise.models import create_model
 
@@ -20,12 +20,8 @@ from mcdenoise.models import create_model
 def export(
     model: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="MODEL")]],
     out: Out,
-    weights: Path | None = None,
     buffers: str | None = None,
-    format: Format | None = None,
     check: Path | None = None,
-    frames: int = 5,
-    json: Json = None,
 ) -> None:
     """Export one step of a model as a graph, with its state as inputs and outputs, for frames of any size.
 
@@ -34,24 +30,19 @@ def export(
 
     Args:
         model: name of a model, see `mcdenoise models`, optionally with settings; a weights file; or your own:
-            path/to/file.py:factory or package.module:factory.
-        out: file to write, .onnx or .pt2.
-        weights: safetensors file with your own weights for that model.
+            path/to/file.py:factory or package.module:factory, with its weights as file.py:factory(weights=FILE).
+        out: file to write, .onnx, or .pt2 for torch.export.load.
         buffers: names of the buffers that frames will have, such as color,albedo,normal,depth,motion; by default those
             of the sequence --check, or else all that the model uses.
-        format: onnx, or torch for torch.export.load; by default from the file name's extension.
-        check: folder of a sequence: run the ONNX graph in onnxruntime on its frames, and print the differences.
-        frames: number of frames to check.
-        json: write the names of inputs and outputs, and the differences, to this file too.
+        check: folder of a sequence: run the ONNX graph in onnxruntime on its first five frames, and print the
+            differences.
     """
     spelling = parse_method(model)
-    weights = spelling.weights if weights is None else weights
+    weights = spelling.weights
     made = create_model(spelling.model, pretrained=weights is None, weights=weights, **spelling.settings)
     sequence = None if check is None else open_sequence(check)
-    if sequence is not None and (format == "torch" or out.suffix == ".pt2"):
+    if sequence is not None and out.suffix == ".pt2":
         raise InputError("--check: expected an ONNX file, for onnxruntime, found another format")
-    if frames < 1:
-        raise InputError(f"--frames: expected at least 1, found {frames}")
     if buffers is not None:
         chosen = frozenset(name.strip() for name in buffers.split(","))
     elif sequence is not None:
@@ -60,14 +51,11 @@ def export(
     else:
         chosen = default_buffers(made)
     start = time.perf_counter()
-    exported = export_model(made, out, buffers=chosen, format=format, name=model)
+    exported = export_model(made, out, buffers=chosen, name=model)
     print(f"{exported.nodes} operators, in {time.perf_counter() - start:.0f} seconds")
     print(f"inputs: {', '.join(exported.inputs)}")
     print(f"outputs: {', '.join(exported.outputs)}")
-    found = {}
     if sequence is not None:
-        for number, difference in differences(exported, made, sequence, frames):
-            found[number] = difference
+        for number, difference in differences(exported, made, sequence):
             print(f"frame {number}: maximum relative difference from torch {difference:.1e}")
-    write_json(json, {"model": model, "inputs": exported.inputs, "outputs": exported.outputs, "differences": found})
     say(f"wrote {out}")

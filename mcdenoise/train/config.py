@@ -33,7 +33,7 @@ class TrainConfig:
             oidn_open(quality=fast); all by default start with random weights.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
-        loss: loss of a clip, see :data:`mcdenoise.train.losses.LOSSES`: smape, the paper's; l1_display, that of Meng et
+        loss: loss of a clip, one of mcdenoise.train.losses.LOSSES: smape, the paper's; l1_display, that of Meng et
             al. 2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
@@ -42,7 +42,7 @@ class TrainConfig:
         learning_rate: highest learning rate of Adam.
         schedule: constant, or cosine down to 0 after a warm-up of 200 steps.
         temporal_weight: weight of the temporal loss.
-        display_weight: weight of the error on a display, see :func:`mcdenoise.train.losses.display_error`.
+        display_weight: weight of the error on a display, as a viewer sees it.
         key: each clip is scaled to this typical radiance, a middle gray such as 0.2, before its light is augmented; 0
             keeps the rendered radiance.
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
@@ -53,7 +53,7 @@ class TrainConfig:
             smaller one replace them.
         start_every: a shot of a model that accumulates also begins at every n-th frame, to train on short histories.
         keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics, see
-            :class:`mcdenoise.models.Accumulated`; 0 for none.
+            Accumulated; 0 for none.
         validation_frames: number of frames at the end of each sequence that are kept for validation (the paper's 4); 0
             for a sequence with less than one clip left.
         lamps: probability that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the
@@ -62,7 +62,7 @@ class TrainConfig:
         tint: each color channel of the light is scaled by up to this many stops.
         gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
         exact_features: train and validate on sequences with exact features only, see
-            :func:`mcdenoise.sampling.has_exact_features`; the others are skipped.
+            has_exact_features; the others are skipped.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: seed of weights and clips.
     """

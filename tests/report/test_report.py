@@ -227,11 +227,13 @@ def test_a_missing_package_is_named(folder: Path, monkeypatch: pytest.MonkeyPatc
         write_report(folder)
 
 
-def test_the_command_says_where_the_page_is_or_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as stop:
-        main(["report", str(tmp_path)])
-    assert stop.value.code == 2
-    assert "mcdenoise report: " in capsys.readouterr().err
+def test_the_command_writes_the_page_of_a_finished_benchmark_again(folder: Path, tmp_path: Path) -> None:
+    (folder / "index.html").unlink(missing_ok=True)
+    for place, status in ((folder, 0), (tmp_path / "nowhere", 2)):
+        with pytest.raises(SystemExit) as stop:
+            main(["benchmark", "-o", str(place)])
+        assert int(stop.value.code or 0) == status
+    assert (folder / "index.html").exists()
 
 
 def test_models_have_colours_of_their_own():
