@@ -152,11 +152,13 @@ def parse_workers(text: str) -> int | None:
     Raises:
         InputError: the number is less than 1.
     """
-    with suppress(ValueError):
-        if (count := int(text)) < 1:
-            raise InputError(f"--workers: expected at least 1, or the address of a Ray cluster, found {count}")
-        return count
-    return None
+    try:
+        count = int(text)
+    except ValueError:
+        return None
+    if count < 1:
+        raise InputError(f"--workers: expected at least 1, or the address of a Ray cluster, found {count}")
+    return count
 
 
 def open_engine(workers: str, *, cpus: float = 1, gpus: float = 0) -> Engine:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,8 +23,7 @@ from mcdenoise.frame import BUFFERS, Frame, Hints
 from mcdenoise.models import Model, State
 from mcdenoise.models._contract import check_needs
 
-Format = Literal["onnx", "torch"]
-SUFFIXES: dict[Format, str] = {"onnx": ".onnx", "torch": ".pt2"}
+SUFFIXES = (".onnx", ".pt2")
 
 # Odd, with different remainders, so that the tracer does not specialize to a property of these sizes.
 _SIZE, _OTHER_SIZE, _BATCH, _OTHER_BATCH = (61, 91), (54, 77), 2, 3
@@ -169,7 +168,6 @@ def export_model(
     path: Path,
     *,
     buffers: Collection[str] | None = None,
-    format: Format | None = None,
     name: str = "",
 ) -> Exported:
     """Write one step of a method as a graph, with the state as inputs and outputs, for frames of any size.
@@ -181,28 +179,28 @@ def export_model(
 
     Args:
         model: the method; it runs in float32 on the CPU while it is traced.
-        path: the file.
+        path: the file, ``.onnx``; or ``.pt2`` for ``torch.export.load``, whose program takes two dicts, buffers and
+            state, and returns the image and a dict.
         buffers: names of the buffers that frames will have; :func:`default_buffers` by default.
-        format: ``"onnx"``, or ``"torch"`` for ``torch.export.load``, whose program takes two dicts, buffers and state,
-            and returns the image and a dict; by default determined by the suffix of the path.
         name: name of the model, stored in the file.
 
     Raises:
         InputError: see :func:`traced`; or a package is missing, the suffix or a buffer is unknown, or the file cannot
             be written. In each case no file is written.
     """
-    kind = _format_of(path, format)
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: expected a file that ends with one of {', '.join(SUFFIXES)}")
     # Check this first, because tracing takes minutes.
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written: expected its folder to exist, found none")
-    if kind == "onnx":
+    if path.suffix == ".onnx":
         _check_packages("onnx", "onnxscript")
     step = Step(model, default_buffers(model) if buffers is None else buffers)
     program = traced(step)
     inputs = (*step.given, *(f"state.{each}" for each in step.state))
     outputs = ("image", *(f"next_state.{each}" for each in step.state))
     about = {"model": name or type(model).__name__, "mcdenoise": version("mcdenoise"), "torch": torch.__version__}
-    write = _write_onnx if kind == "onnx" else _write_torch
+    write = _write_onnx if path.suffix == ".onnx" else _write_torch
     with atomic_path(path) as temporary:
         write(program, temporary, inputs, outputs, about)
     return Exported(path, inputs, outputs, len(program.graph.nodes))
@@ -323,18 +321,6 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
-
-
-def _format_of(path: Path, format: Format | None) -> Format:
-    known = ", ".join(SUFFIXES.values())
-    found = next((kind for kind, suffix in SUFFIXES.items() if path.suffix == suffix), None)
-    if format is None and found is None:
-        raise InputError(f"{path}: expected a file that ends with one of {known}, or a --format")
-    if format is not None and format not in SUFFIXES:
-        raise InputError(f"format: expected one of {', '.join(SUFFIXES)}, found '{format}'")
-    if format is not None and found not in (None, format):
-        raise InputError(f"{path}: expected a name that ends with {SUFFIXES[format]}, found {path.suffix}")
-    return format or found or "onnx"
 
 
 def _check_packages(*names: str) -> None:

@@ -32,7 +32,7 @@ cli.main()
 """
 # A further command, whose work is one statement.
 OWN = """
-import concurrent.futures, contextlib, hashlib, importlib, pathlib, sys, threading, time, types
+import contextlib, hashlib, importlib, pathlib, sys, time, types
 from mcdenoise import cli
 
 def wait():
@@ -47,18 +47,6 @@ def swallowed():
         with contextlib.suppress(BaseException):
             time.sleep(60)
 
-def another():
-    try:
-        time.sleep(60)
-    except BaseException as error:
-        raise RuntimeError("no compiled object yet") from error
-
-def deep():
-    try:
-        time.sleep(60)
-    finally:
-        deep()
-
 class Destroyed:
     def __del__(self):
         time.sleep(0.2)
@@ -66,22 +54,6 @@ class Destroyed:
 def destroyed():
     while True:
         Destroyed()
-
-def failing_thread():
-    def fail():
-        raise ValueError("of a thread")
-    try:
-        time.sleep(60)
-    finally:
-        thread = threading.Thread(target=fail)
-        thread.start()
-        thread.join()
-
-def left():
-    try:
-        time.sleep(60)
-    finally:
-        sys.exit(0)
 
 def tidied(how):
     try:
@@ -108,24 +80,15 @@ sys.modules[page.__name__] = page
 cli.main()
 """
 MOMENTS = {
-    "Python": "while True: pass",
     "sleep": "time.sleep(60)",
     "compiled code": "endless()",
     "an import": "importlib.import_module('slow_module')",
     "what swallows it": "swallowed()",
-    "what turns it into another": "another()",
-    "a recursion": "deep()",
     "destructors": "destroyed()",
-    "threads": "concurrent.futures.ThreadPoolExecutor(1).submit(time.sleep, 60).result()",
-    "a thread that fails": "failing_thread()",
-    "what exits": "left()",
-    "what tidies up without end": "tidied(lambda: time.sleep(60))",
     "what tidies up in compiled code": "tidied(endless)",
 }
 WRITING = {
     "a file": "file(lambda: time.sleep(60))",
-    "a folder": "folder(lambda: time.sleep(60))",
-    "a file, in compiled code": "file(endless)",
     "a folder, in compiled code": "folder(endless)",
 }
 
@@ -182,7 +145,7 @@ def interrupt(folder: Path, moment: str, number: signal.Signals = signal.SIGINT)
 
 
 # The others take seconds each.
-QUICK = ("sleep", "compiled code", "destructors", "a file")
+QUICK = ("compiled code", "destructors", "a file")
 
 
 @pytest.mark.parametrize(
@@ -192,10 +155,8 @@ def test_whatever_a_command_does_it_can_be_interrupted(moment: str, tmp_path: Pa
     interrupt(tmp_path, (MOMENTS | WRITING)[moment])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("moment", ["sleep", "compiled code"])
-def test_other_signals_end_it_alike(moment: str, number: signal.Signals, tmp_path: Path) -> None:
-    interrupt(tmp_path, MOMENTS[moment], number)
+def test_other_signals_end_it_alike(tmp_path: Path) -> None:
+    interrupt(tmp_path, MOMENTS["sleep"], signal.SIGTERM)
 
 
 def test_signals_that_were_ignored_stay_ignored(tmp_path: Path) -> None:
@@ -267,7 +228,7 @@ def scene(folder: Path) -> list[object]:
 
 
 def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
-    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=3, seed=0)
+    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=2, seed=0)
 
 
 @pytest.mark.slow
@@ -278,22 +239,6 @@ def test_many_moments_of_denoise(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_many_moments_while_kernels_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # No room for what is compiled, so that it is compiled each time.
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/none")
-    monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
-    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=20, seed=2)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("workers", [1, 2])
-def test_many_moments_of_render(workers: int, tmp_path: Path) -> None:
-    arguments = [*scene(tmp_path), "--workers", workers]
-    interrupted_at_random(tmp_path, "render", arguments, count=20, seed=3)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_many_moments_of_what_only_prints(tmp_path: Path) -> None:
-    interrupted_at_random(tmp_path, "models", [], count=20, seed=4)
+def test_many_moments_of_render(tmp_path: Path) -> None:
+    arguments = [*scene(tmp_path), "--workers", 2]
+    interrupted_at_random(tmp_path, "render", arguments, count=12, seed=3)

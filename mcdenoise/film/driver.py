@@ -19,7 +19,8 @@ from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import Counter
-from mcdenoise.film.work import RECORDS, Found, Order, Summary
+from mcdenoise.film.summary import Summary, summarize
+from mcdenoise.film.work import RECORDS, Found, Order
 from mcdenoise.folder import make_folder
 from mcdenoise.results import Results
 
@@ -252,7 +253,7 @@ class _Shot:
         return Task(work.make, (self.order, piece), made, failed, _MAKE, self.count)
 
     def _summarize(self) -> Task:
-        return Task(work.summarize, (self.order,), self._summarized, self._failed, _SUMMARIZE)
+        return Task(summarize, (self.order,), self._summarized, self._failed, _SUMMARIZE)
 
     def _summarized(self, summary: Summary) -> Iterable[Task]:
         """Denoise frames again whose files have changed meanwhile, once; those that change again are not finished."""

@@ -6,7 +6,7 @@ import difflib
 import glob
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
@@ -101,7 +101,12 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     if not isinstance(every, dict):
         raise InputError(f"{path}: expected 'every' to be a table, found {_found(every)}; write [every]")
     settings = _settings(every, settings, f"{path}, [every]", path.parent)
-    if isinstance(pattern, str) and tables is None:
+    if pattern is not None:
+        if tables is not None or not isinstance(pattern, str):
+            raise InputError(
+                f"{path}: expected 'shots' to be a pattern of folders, and no table [[shot]] beside it, found "
+                f"{_found(pattern)}; write one of both"
+            )
         return _of_pattern(path.parent / pattern, settings)
     if not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
         raise InputError(
@@ -168,22 +173,23 @@ def _typed(kind: Any, value: Any, where: str) -> Any:
     # TOML has no null: a setting that is None is not in the table.
     if NoneType in get_args(kind):
         (kind,) = (each for each in get_args(kind) if each is not NoneType)
+    make: Callable[[Any], Any] = kind
     if get_origin(kind) is Literal:
-        fits, expected, made = value in get_args(kind), f"one of {', '.join(get_args(kind))}", lambda: value
+        fits, expected, make = value in get_args(kind), f"one of {', '.join(get_args(kind))}", str
     elif get_origin(kind) is tuple:
-        texts = [value] if isinstance(value, str) else value
-        fits = isinstance(texts, list) and all(isinstance(each, str) for each in texts)
-        expected, made = "a text or a list of texts", lambda: tuple(texts)
+        value = [value] if isinstance(value, str) else value
+        fits = isinstance(value, list) and all(isinstance(each, str) for each in value)
+        expected, make = "a text or a list of texts", tuple
     else:
         # In Python, True and False are integers.
         fits = isinstance(value, bool) is (kind is bool)
         fits = fits and isinstance(value, (int, float) if kind is float else str if kind is Path else kind)
         # Written so that NaN is out of range.
         fits = fits and (isinstance(value, str) or abs(value) < _LIMIT)
-        expected, made = f"{_WORDS[kind]}{' below 2^63' if kind in (int, float) else ''}", lambda: kind(value)
+        expected = f"{_WORDS[kind]}{' below 2^63' if kind in (int, float) else ''}"
     if not fits:
         raise InputError(f"{where}: expected {expected}, found {_found(value)}; change it")
-    return made()
+    return make(value)
 
 
 def _absolute(settings: ShotSettings, base: Path, chosen: Iterable[str]) -> ShotSettings:

@@ -67,8 +67,8 @@ class FrameRecord:
                 return None
             report = found["report"]
             report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
-            *counts, place = report["repairs"]
-            report["repairs"] = Repairs(*counts, tuple(place))
+            filled, limited, clamped, negative, gained, place = report["repairs"]
+            report["repairs"] = Repairs(filled, limited, clamped, negative, gained, tuple(place))
             inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])
             own = {**found, "result": _stamp(found["result"]), "inputs": inputs, "report": FrameReport(**report)}
             return cls(**own)

@@ -1,4 +1,4 @@
-"""The tasks of a film: scan a shot, denoise a piece of it, and summarize it when all pieces have ended.
+"""The tasks of a film: scan a shot, and denoise a piece of it; `summary` has the last one.
 
 A task depends on its arguments and on the disk alone, so that any worker can run it, and retry it. Arguments and
 answers are small: workers read and write the frames themselves.
@@ -7,28 +7,25 @@ answers are small: workers read and write the frames themselves.
 from __future__ import annotations
 
 import functools
-import os
 import secrets
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import remove, sweep
-from mcdenoise.data.readers.opening import open_result
+from mcdenoise.data.files import remove
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.engines import describe_error
 from mcdenoise.errors import InputError
-from mcdenoise.film.manifest import PICTURES, Shot
+from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import (
     FrameRecord,
@@ -40,17 +37,16 @@ from mcdenoise.film.record import (
     stamp,
     stamp_and_digest,
 )
-from mcdenoise.folder import FrameError, check_apart, make_folder, new_report, write_frames, write_report
+from mcdenoise.folder import FrameError, check_apart, make_folder, new_report, write_frames
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import find_weights, frames_remembered
-from mcdenoise.preview import Preview
 
 # Folder of the records, beside the shots.
 RECORDS = ".film"
 # Settings that change no pixel of a result.
 _SILENT = {"frames", "threads", "preview", "preview_fps", "preview_exposure", "results", "max_memory"}
-# Largest side of the images whose change is measured, and of a thumbnail; thumbnails in the strip, and of the worst.
-_SMALL, _THUMBNAIL, _STRIP, _WORST = 64, 320, 6, 3
+# Largest side of the images whose change is measured.
+_SMALL = 64
 
 
 @dataclass(frozen=True)
@@ -113,26 +109,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Summary:
-    """The summary of a shot.
-
-    Args:
-        milliseconds: median run time of each stage.
-        frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
-        pictures: paths of the thumbnails, by number of the frame, relative to the page.
-        warnings: what is probably wrong, a line each.
-        unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
-    """
-
-    milliseconds: Mapping[str, float]
-    frames: tuple[Mapping[str, Any], ...]
-    pictures: Mapping[int, str]
-    warnings: tuple[str, ...]
-    unfinished: frozenset[int] = frozenset()
-
-
-@dataclass(frozen=True)
-class _Opened:
+class Opened:
     """A shot with its frames opened, and its denoiser."""
 
     shot: Shot
@@ -149,7 +126,7 @@ class _Opened:
         return self.sequence.numbers[first : place + 1]
 
 
-class _Keys:
+class Keys:
     """Keys of frames. Frames are asked for in ascending order, so that each file is read at most once.
 
     A digest that is taken before the frame is read is that of the pixels, or of a file that is replaced meanwhile: then
@@ -159,7 +136,7 @@ class _Keys:
         opened: the shot.
     """
 
-    def __init__(self, opened: _Opened) -> None:
+    def __init__(self, opened: Opened) -> None:
         self.opened = opened
         self._recorded: dict[Stamp, str] = {}
         self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
@@ -195,9 +172,9 @@ def scan(order: Order) -> Found:
     Raises:
         InputError: the shot cannot be opened, or cannot be denoised with these settings.
     """
-    opened = _opened(order)
+    opened = open_order(order)
     numbers = tuple(opened.sequence.numbers)
-    done = frozenset(_Keys(opened).finished(order, numbers))
+    done = frozenset(Keys(opened).finished(order, numbers))
     return Found(opened.shot, numbers, done, opened.unreadable, opened.overlap)
 
 
@@ -215,18 +192,18 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
     Raises:
         InputError: as :func:`scan`.
     """
-    opened = _opened(order)
+    opened = open_order(order)
     make_folder(order.folder)
     check_apart(opened.sequence, order.folder)
     # That file says that the shot is complete.
     remove(order.folder / "denoise.json")
-    left = set(piece.wanted) - _Keys(opened).finished(order, piece.wanted).keys()
+    left = set(piece.wanted) - Keys(opened).finished(order, piece.wanted).keys()
     failed: dict[int, str] = {}
     try:
         with Journal.open(order.records / f"{order.run}{secrets.token_hex(8)}.jsonl") as journal:
             # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
             for part in cut(piece.numbers, left, 0, opened.overlap):
-                numbers, keys = list(part.numbers), _Keys(opened)
+                numbers, keys = list(part.numbers), Keys(opened)
                 while left & set(numbers):
                     try:
                         _Writer(order, keys, journal, left).write(numbers)
@@ -239,41 +216,10 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
     return failed
 
 
-def summarize(order: Order) -> Summary:
-    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview.
-
-    Raises:
-        InputError: as :func:`scan`, or something cannot be written.
-    """
-    opened = _opened(order)
-    found = _Keys(opened).finished(order, opened.sequence.numbers)
-    records = list(found.values())
-    report = new_report(opened.sequence, _name(opened.shot), opened.shot.picked)
-    report.frames = {each.number: each.report for each in records}
-    report.files = {each.number: order.result(each) for each in records}
-    report.alike = [each.number for each in records if each.alike]
-    for folder in (order.folder, order.records):
-        sweep(folder, youngest=0)
-    unfinished = frozenset(opened.sequence.numbers) - found.keys()
-    if not unfinished and not opened.unreadable:
-        write_report(opened.sequence, order.folder, opened.denoiser, report)
-        if opened.shot.settings.preview:
-            _preview(order, opened, report.files)
-    described = _described(records)
-    warnings = [*opened.sequence.warnings, *(report.warnings if records else [])]
-    return Summary(
-        report.milliseconds if records else {},
-        tuple(described),
-        _pictures(order, records, described),
-        tuple(warnings),
-        unfinished,
-    )
-
-
 class _Writer:
     """Denoises frames, and records each as it is finished."""
 
-    def __init__(self, order: Order, keys: _Keys, journal: Journal, left: set[int]) -> None:
+    def __init__(self, order: Order, keys: Keys, journal: Journal, left: set[int]) -> None:
         self.order, self.keys, self.journal, self.left = order, keys, journal, left
         self.opened = keys.opened
         self.report = new_report(self.opened.sequence, "")
@@ -316,7 +262,7 @@ class _Writer:
 
 
 @functools.lru_cache(1)
-def _opened(order: Order) -> _Opened:
+def open_order(order: Order) -> Opened:
     """Open a shot; the last one is cached, because a worker may denoise several pieces of it."""
     keep_heap()
     if order.shot.settings.max_memory is not None:
@@ -340,7 +286,7 @@ def _opened(order: Order) -> _Opened:
     )
     # After the scan the model is named, and the reason is that of the scan.
     shot = replace(order.shot, settings=settings, picked=choice or order.shot.picked)
-    return _Opened(shot, sequence, denoiser, overlap, unreadable, described)
+    return Opened(shot, sequence, denoiser, overlap, unreadable, described)
 
 
 @functools.lru_cache(1)
@@ -386,11 +332,6 @@ def _weights(settings: Any) -> list[str]:
         raise InputError(f"{paths[0]}: expected a file to read, found: {error.strerror}; check the path") from error
 
 
-def _name(shot: Shot) -> str:
-    spelling = shot.settings.spelling
-    return str(spelling.weights or spelling.name)
-
-
 def _small(image: Tensor) -> Tensor:
     """A small image whose change from frame to frame is measured."""
     height, width = image.shape[-2:]
@@ -403,56 +344,3 @@ def _difference(one: Tensor, other: Tensor) -> float | None:
     if one.shape != other.shape:
         return None
     return float((one - other).abs().mean() / (one.mean() + other.mean()).clamp_min(1e-6))
-
-
-def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:
-    """Rows of the page, a frame each; ``score`` is the smaller one of its changes from both neighbours."""
-    rows: list[dict[str, Any]] = []
-    changes = {each.number: each.change for each in records}
-    for each in records:
-        sides = [c for c in (changes.get(each.number), changes.get(each.number + 1)) if c is not None]
-        rows.append(
-            {
-                "number": each.number,
-                "change": each.change,
-                "history": each.report.history,
-                "reset": each.report.reset,
-                "replaced_pixels": each.report.replaced_pixels,
-                "milliseconds": sum(each.report.milliseconds.values()),
-                "score": min(sides, default=0.0),
-            }
-        )
-    return rows
-
-
-def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str, Any]]) -> dict[int, str]:
-    """Write thumbnails of the frames with the highest scores, and of some frames across the shot."""
-    if not records:
-        return {}
-    worst = sorted(described, key=lambda row: (-row["score"], row["number"]))[:_WORST]
-    steps = np.linspace(0, len(records) - 1, min(_STRIP, len(records))).round().astype(int)
-    wanted = {row["number"] for row in worst} | {records[step].number for step in steps}
-    shown = Preview(order.out / PICTURES / order.shot.name, video=False)
-    found = {}
-    for record in records:
-        if record.number not in wanted:
-            continue
-        try:
-            image, metadata = open_result(order.result(record)).read()
-        except InputError:
-            continue
-        height, width = image.shape[-2:]
-        scale = min(1.0, _THUMBNAIL / max(height, width))
-        image = F.interpolate(image, (max(1, round(height * scale)), max(1, round(width * scale))), mode="area")
-        shown.add(f"{record.number}", image, metadata)
-        found[record.number] = os.path.relpath(shown.written[-1], order.out)
-    return found
-
-
-def _preview(order: Order, opened: _Opened, files: Mapping[int, Path]) -> None:
-    """Write the preview of `mcdenoise denoise --preview` from the files, whose frames were denoised in any order."""
-    shown = opened.shot.settings.preview_in(order.folder, video=len(files) > 1)
-    for path in files.values():
-        image, metadata = open_result(path).read(opened.sequence.window)
-        shown.add(path.stem, image, metadata)
-    shown.close()

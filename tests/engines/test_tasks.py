@@ -8,6 +8,7 @@ import sys
 from collections.abc import Hashable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 from calls import die_at_first, fail, fail_strangely, mark
@@ -31,9 +32,7 @@ class Run:
         self.failed: dict[str, str] = {}
         self.tasks: list[Task] = []
 
-    def add(
-        self, name: str, function: object, *arguments: object, then: tuple[Task, ...] = (), **options: object
-    ) -> None:
+    def add(self, name: str, function: object, *arguments: object, then: tuple[Task, ...] = (), **options: Any) -> None:
         def done(answer: object) -> tuple[Task, ...]:
             self.answers[name] = answer
             return then
@@ -130,7 +129,7 @@ def kill_children() -> int:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 @pytest.mark.filterwarnings("ignore:resource_tracker")
 def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
-    killed = []
+    killed: list[int] = []
 
     class Attacked(LocalEngine):
         """While workers start, after they have started, and while they wait for a task."""

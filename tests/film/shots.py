@@ -45,7 +45,7 @@ class Inline:
         return found
 
     def close(self) -> None:
-        work._opened.cache_clear()
+        work.open_order.cache_clear()
 
 
 def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:

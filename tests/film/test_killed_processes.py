@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import random
-import signal
 import subprocess
 import sys
 import time
@@ -33,7 +31,7 @@ class Attacked(LocalEngine):
 
     def finished(self, seconds: float) -> dict[Hashable, Done]:
         if self._running and len(list(self.out.glob("s*/*.exr"))) >= self.wanted:
-            os.kill(self.random.choice(list(self._running.values())).process.pid, signal.SIGKILL)
+            self.random.choice(list(self._running.values())).process.kill()
             self.killed += 1
             self.wanted += self.random.randint(1, self.most)
         return super().finished(0.01)

@@ -55,4 +55,4 @@ def test_memory_is_flat_over_thousands_of_frames(tmp_path: Path, monkeypatch: py
     early, late = measured.values()
     print(f"{early / 1e6:.1f} MB after {FRAMES // 5} frames, {late / 1e6:.1f} MB after {FRAMES}")
     assert late < 1.01 * early
-    work._opened.cache_clear()
+    work.open_order.cache_clear()

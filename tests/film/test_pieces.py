@@ -119,8 +119,6 @@ def long_shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("settings", "joint"),
     [
         (ShotSettings("accumulated", alpha_min=0.4), 1e-2),
-        (ShotSettings("joint_bilateral", alpha_min=0.4), 1e-2),
-        (ShotSettings("svgf"), 3e-2),
         (ShotSettings("noisy"), 1e-2),
     ],
     ids=lambda value: str(getattr(value, "model", value)),
