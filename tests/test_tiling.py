@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from planes import synthetic
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
 from mcdenoise.benchmark.memory import output_and_peak
@@ -23,24 +24,6 @@ def refused(action: Callable[[], object]) -> str:
         action()
     assert "\n" not in str(error.value)
     return str(error.value)
-
-
-def synthetic(width: int, height: int, seed: int = 0) -> Frame:
-    """Noise on a checkered floor under a sky that nothing is hit in, with motion."""
-    generator = torch.Generator().manual_seed(seed)
-    rows, columns = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
-    floor = (rows > 0.3)[None, None]
-    checker = ((rows * 8).floor() + (columns * 8).floor()) % 2
-    noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
-    albedo = (0.2 + 0.6 * checker).expand(1, 3, -1, -1) * floor
-    normal = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1) * floor
-    return Frame(
-        color=torch.where(floor, albedo * noise, 0.7),
-        albedo=albedo,
-        normal=normal,
-        depth=torch.where(floor, 1 / rows.clamp_min(0.1), torch.inf),
-        motion=torch.full((1, 2, height, width), 0.3),
-    )
 
 
 def small_model() -> Model:
