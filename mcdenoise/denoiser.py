@@ -132,8 +132,8 @@ class Denoiser:
             frame of the shot. Decisions are treated as constants: which pixels have a history, how much history is
             discarded, and the exposure. The images do not change. Frames of float64 are computed in float64 if the
             weights are, too.
-        alpha: also denoise the alpha of frames, with the kernels of the color; a method without kernels keeps it, and
-            the report says so. The color stays a pair with it, also at the rim of what it covers.
+        alpha: also denoise the alpha of frames, with the kernels of a method that has kernels, and by its own noise.
+            The color stays a pair with it, also at the rim of what it covers.
         wrap: frames are panoramas of 360 degrees: the image continues at its left and right border with the other one,
             so that there is no seam. Cameras are not used, as a matrix describes no panorama; the motion of a pixel may
             lead over the border.

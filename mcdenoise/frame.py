@@ -106,7 +106,7 @@ class Hints(NamedTuple):
         alone: there is no previous frame either.
         stages: the intermediate images are also requested.
         keep_all: nothing may be skipped, even if the scene does not need it.
-        alpha: the alpha is also to be denoised, with the kernels of the color; otherwise it is ignored.
+        alpha: the alpha is also to be denoised; otherwise it is ignored.
     """
 
     still: bool = False

@@ -63,8 +63,7 @@ class MitsubaDenoiser:
         albedo: whether calls pass an albedo. As with OptiX, buffers that are not declared here are ignored.
         normals: whether calls pass shading normals; unlike with OptiX, these do not require an albedo.
         temporal: whether calls are the frames of a shot, with flow; otherwise each frame is a still.
-        denoise_alpha: whether alpha, the second or fourth channel, is denoised with the kernels of the color;
-            otherwise, and by methods without kernels, it is returned unchanged.
+        denoise_alpha: whether alpha, the second or fourth channel, is denoised; otherwise it is returned unchanged.
         model: as for :class:`mcdenoise.Denoiser`; by default ``"oidn_tuned"``, for features through a pixel
             filter, or ``"cascaded_v3"`` for settings of the history, or the one that the weights are for.
         device: device of torch; by default a GPU for the CUDA variants if torch has one, otherwise the CPU.

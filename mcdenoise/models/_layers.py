@@ -76,12 +76,12 @@ def completed(frame: Frame, output: Output) -> Output:
     """Add layers that sum to the image, and an alpha, to an output of a frame that has them.
 
     If the method returned no layers, the image is split by :func:`fractions`; if it returned no alpha, the frame's
-    alpha is kept.
+    alpha is kept; the host removes its noise.
     """
     alpha = output.alpha
     if alpha is None and alpha_of(frame) is not None:
         alpha = frame.alpha
-        output = _noted_once(output, Note("alpha", "unchanged: the method has no kernels"))
+        output = _noted_once(output, Note("alpha", "the method has no kernels: filtered by its own noise"))
     if not frame.layers:
         return output._replace(alpha=alpha)
     parts = output.layers

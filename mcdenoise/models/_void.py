@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._alpha import noise_of_alpha, without_noise
 from mcdenoise.models._interface import Output
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models.exposed import scaled
@@ -28,6 +29,8 @@ _GLOW = 1e-3
 _LEAST = 1e-3
 # Side of the window of pixels that are partly covered in which alpha is no edge.
 _RAMP = 5
+# Name of the buffer with the number of each pixel's chart. No renderer uses this name.
+ISLAND = "(island)"
 # Buffers that are not filled: they are no picture, or are not denoised.
 _KEPT = frozenset({"alpha", "mask", "reference", "length", "view_projection"})
 
@@ -37,11 +40,11 @@ class Void(NamedTuple):
 
     Args:
         mask: ``(B, 1, H, W)`` bool: void pixels; ``None`` if there is none.
-        alpha: ``(B, 1, H, W)`` by which the light was divided; ``None`` if it was not.
+        divided: ``(B, 1, 1, 1)`` bool: whether the light was divided by alpha; ``None`` if none was.
     """
 
     mask: Tensor | None = None
-    alpha: Tensor | None = None
+    divided: Tensor | None = None
 
 
 def without_void(frame: Frame) -> tuple[Frame, Void]:
@@ -51,6 +54,9 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
     camera, where the depth is infinite and the color 0. Alpha and depth only count if no more than a thousandth of the
     light is where they say that nothing is.
 
+    In a frame without motion and camera, in which no pixel is partly covered, connected pixels that are not void are a
+    chart. The numbers of charts are a buffer of their own, :data:`ISLAND`, for methods that compare features.
+
     Args:
         frame: as a renderer wrote it, its values unchecked.
 
@@ -59,51 +65,60 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
     """
     color, alpha, depth, known = frame.color, frame.alpha, frame.depth, at_hand(frame.color.device)
     void = None if frame.mask is None else frame.mask <= 0
-    chart = frame.motion is None and frame.view_projection is None and alpha is None and void is None
+    chart = known and frame.motion is None and frame.view_projection is None
     # Not on a GPU, where nearly every frame would be filled without need.
-    nothing = alpha <= 0 if alpha is not None else depth == torch.inf if chart and known and depth is not None else None
-    frame, divisor = frame.replace(mask=None), None
+    nothing = None if alpha is None else alpha <= 0
+    if chart and alpha is None and void is None and depth is not None:
+        nothing = depth.isposinf()
+    frame, divided = frame.replace(mask=None), None
     if nothing is not None:
         covers = _covers(color, nothing)
         empty = nothing & (color == 0).all(1, keepdim=True) & covers
         void = empty if void is None else void | empty
         if alpha is not None and frame.hints.alpha:
-            divisor = torch.where(covers, alpha.clamp(_LEAST, 1), 1)
-            frame = _divided(frame, divisor)
+            divided = covers
+            frame = _divided(frame, torch.where(covers, alpha.clamp(_LEAST, 1), 1))
     if void is None or (known and not void.any()):
-        return frame, Void(None, divisor)
+        return frame, Void(None, divided)
     source = _mirrored(void)
 
     def fill(image: Tensor) -> Tensor:
         flat = image.flatten(1, -3).flatten(2)
         return flat.gather(2, source.expand(-1, flat.shape[1], -1)).reshape(image.shape)
 
+    if chart and (alpha is None or not ((alpha > 0) & (alpha < 1)).any()):
+        frame = frame.replace(extra={**frame.extra, ISLAND: _islands(~void).to(color.dtype)})
     kept = {name: image for name, image in frame.items() if name in _KEPT}
-    return frame.replace(**dict.fromkeys(kept)).map(fill).replace(**kept), Void(void, divisor)
+    return frame.replace(**dict.fromkeys(kept)).map(fill).replace(**kept), Void(void, divided)
 
 
 def with_void(output: Output, frame: Frame, void: Void) -> Output:
     """The output with the light in the unit of the given frame, and with its void pixels as they were.
 
-    An alpha that was filtered is used inside of wide ramps; at an edge it is the frame's own: the light that guided the
-    filter is that of the surface, and does not tell where the surface ends.
+    An alpha that was filtered is used inside of wide ramps; at an edge it is the frame's own, without its noise: the
+    light that guided the filter is that of the surface, and does not tell where the surface ends. An alpha without
+    noise stays.
 
     Args:
         output: of the frame without void.
         frame: as it was given.
         void: result of :func:`without_void`.
     """
-    alpha, divisor = frame.alpha, void.alpha
+    alpha, mask = frame.alpha, void.mask
     if alpha is not None and output.alpha is not None:
-        filtered = output.alpha
-        partly = ((alpha <= 0) | (alpha >= 1)).to(alpha.dtype)
-        after = torch.where(F.max_pool2d(partly, _RAMP, 1, _RAMP // 2) > 0, alpha, filtered)
+        after = _alpha(alpha, output.alpha)
+        if frame.mask is not None:
+            after = torch.where(frame.mask <= 0, alpha, after)
         output = output._replace(alpha=after)
-        if divisor is not None:
-            # Where the light was not divided, it stays as it is.
-            multiplier = torch.where(divisor == alpha.clamp(_LEAST, 1), after.clamp(_LEAST, 1), divisor)
+        if void.divided is not None:
+            # A glow where no surface is keeps its light.
+            surface = (alpha > 0) if mask is None else (alpha > 0) | mask
+            multiplier = torch.where(surface, after, alpha).clamp(_LEAST, 1)
+            multiplier = torch.where(void.divided, multiplier, 1)
             output = _light(output, lambda image: image * multiplier)
-    if (mask := void.mask) is None:
+            # A pixel that only noise left empty has the light of the surface.
+            mask = None if mask is None else mask & ((after <= 0) | (alpha > 0))
+    if mask is None:
         return output
     given = torch.where(torch.isfinite(frame.color), frame.color, 0).clamp_min(0)
     layers = {
@@ -111,6 +126,20 @@ def with_void(output: Output, frame: Frame, void: Void) -> Output:
         for name, layer in output.layers.items()
     }
     return output._replace(image=torch.where(mask, given.to(output.image.dtype), output.image), layers=layers)
+
+
+def _alpha(alpha: Tensor, filtered: Tensor) -> Tensor:
+    """The alpha of the output: that of the frame, and that of the method within ramps, without noise."""
+    noise = noise_of_alpha(alpha)
+    if at_hand(alpha.device) and not noise.any():
+        return alpha
+    own = without_noise(alpha, noise)
+    if filtered is not alpha:
+        filtered = without_noise(filtered.to(alpha.dtype), noise_of_alpha(filtered.to(alpha.dtype)))
+        partly = ((alpha <= 0) | (alpha >= 1)).to(alpha.dtype)
+        edge = F.max_pool2d(partly, _RAMP, 1, _RAMP // 2) > 0
+        own = torch.where(edge | (noise <= 0), own, filtered)
+    return own
 
 
 def _covers(color: Tensor, nothing: Tensor) -> Tensor:
@@ -160,6 +189,21 @@ def _mirrored(void: Tensor) -> Tensor:
         source = torch.where(known, whole, found).flatten(1)
         known = known | (nearest < height + width)
     return source[:, None]
+
+
+def _islands(known: Tensor) -> Tensor:
+    """The number of the group of connected pixels, of those that are known, in which each is; 0 for the others."""
+    pixels = known[0].numel()
+    # Integers are exact, and floats can be pooled.
+    number = torch.arange(1, pixels + 1, dtype=torch.float64, device=known.device).reshape(known[:1].shape) * known
+    while True:
+        largest = (F.max_pool2d(number, 3, 1, 1) * known).flatten(1)
+        # The pixel with that number may have seen a larger one: so a long group needs few rounds.
+        after = largest.gather(1, (largest.long() - 1).clamp_min(0)).reshape(known.shape) * known
+        if torch.equal(after, number):
+            _, place = torch.unique(number, return_inverse=True)
+            return torch.as_tensor(place).reshape(known.shape)
+        number = after
 
 
 def _light(output: Output, function: Callable[[Tensor], Tensor]) -> Output:

@@ -33,7 +33,8 @@ class Guided(nn.Module):
 
     In each window the light is a linear function of the guides (He et al. 2010, Eqs. 4 to 6), and each pixel takes the
     mean of the functions of all windows in which it lies (Eq. 8), so that the light keeps the edges of the guides. A
-    linear function may be negative, and is clamped to 0. Without features the light's logarithm is the guide.
+    linear function may be negative, and is clamped to 0. Without features the light's logarithm is the guide,
+    of which a median of 3x3 pixels is taken, since a guide with noise would keep the noise.
 
     Args:
         radius: radius of the windows in pixels, at least 1.
@@ -55,7 +56,8 @@ class Guided(nn.Module):
     @property
     def needs(self) -> Needs:
         """Color; features guide. A pixel sees all windows that it lies in."""
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=2 * self.radius, live=_LIVE)
+        reach = 2 * self.radius + 1
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=reach, live=_LIVE)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """See :func:`mcdenoise.models.joint_bilateral.guide_statistics`."""

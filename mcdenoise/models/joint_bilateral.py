@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
@@ -16,6 +17,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
+from mcdenoise.models._void import ISLAND
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
@@ -26,16 +28,19 @@ from mcdenoise.ops._steps.network import normalized_depth
 
 # Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
 DEPTH_SCALE = 10.0
+# Charts may differ in light by a factor of a thousand, of which nothing should pass.
+ISLAND_SCALE = 30.0
 # kornia unfolds the windows of small images, of those that have derivatives, and on a GPU: 25x25 pixels of a 1280x720
 # image would take more than 20 GB at once. So they go in tiles of at most so many values.
 _UNFOLDED_VALUES = 250_000_000
-_CHANNELS = 10  # of image and guide
+_CHANNELS = 11  # of image and guide
 
 
 class JointBilateral(nn.Module):
     """``kornia.filters.joint_bilateral_blur``, guided by albedo, normal and depth, as far as the frame has them.
 
-    A frame without any guides itself by its logarithm, which is the bilateral filter.
+    A frame without any guides itself by its logarithm, of which a median of 3x3 pixels is taken: a guide with noise
+    would keep the noise.
 
     Args:
         sigma_color: standard deviation in the guides' space, where albedos and normals have their own unit and depths
@@ -59,7 +64,7 @@ class JointBilateral(nn.Module):
         """Color; features guide."""
         # Its windows, unfolded, and as much again for their weights' derivatives.
         live = Live(0, 2 * _CHANNELS * (2 * self.radius + 1) ** 2)
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius, live=live)
+        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius + 1, live=live)
 
     @property
     def side(self) -> int:
@@ -93,14 +98,26 @@ class JointBilateral(nn.Module):
 def guide_of(frame: Frame, depth_weight: float) -> Tensor:
     """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color's logarithm.
 
-    That is ``log1p(e x)`` with the exposure ``e`` of the image, so that no unit and no lamp matters.
+    That is the median of ``log1p(e x)`` in 3x3 pixels, with the exposure ``e`` of the image, so that no unit and no
+    lamp matters. The number of a pixel's chart, where the frame has charts, is one more guide.
     """
     guides = [image for image in (frame.albedo, frame.normal) if image is not None]
     statistics = {**frame.statistics, **guide_statistics(frame)}
     if frame.depth is not None:
         near, typical = statistics["depth_scale"].split(1, 1)
         guides.append(depth_weight * normalized_depth(frame.depth, near, typical))
-    return torch.cat(guides, 1) if guides else torch.log1p(frame.color * statistics["exposure"])
+    if not guides:
+        guides.append(_median(torch.log1p(frame.color * statistics["exposure"])))
+    guides += [ISLAND_SCALE * image for name, image in frame.extra.items() if name == ISLAND]
+    return torch.cat(guides, 1)
+
+
+def _median(image: Tensor) -> Tensor:
+    from kornia.filters import median_blur
+
+    # kornia's own border is zero.
+    padded: Tensor = median_blur(F.pad(image, (1, 1, 1, 1), mode="replicate"), 3)
+    return padded[..., 1:-1, 1:-1]
 
 
 def guide_statistics(frame: Frame) -> dict[str, Tensor]:

@@ -56,6 +56,21 @@ def test_never_negative_and_finite_with_fireflies_and_background() -> None:
     assert image.min() >= 0
 
 
+@pytest.mark.parametrize("model", ["guided", "joint_bilateral"])
+def test_noise_does_not_guide_itself(model: str) -> None:
+    """Without features, noise of a constant image goes, an edge stays, and an infinite pixel stays local."""
+    right = (torch.arange(64) >= 32).expand(1, 3, 48, 64)
+    clean = torch.where(right, 1.0, 0.1)
+    uniform = torch.rand(8, 1, 1, 48, 64, generator=torch.Generator().manual_seed(0))
+    given = clean * -uniform.log().mean(0)
+    image = Denoiser(model)(Frame(given))
+    assert (image / clean - 1).abs().mean() < 0.25 * (given / clean - 1).abs().mean()
+    spot = given.clone()
+    spot[..., 24, 12] = torch.inf
+    other = Denoiser(model)(Frame(spot))
+    assert ((other / image - 1).abs()[..., :, 21:]).max() < 1e-2
+
+
 def test_has_no_weights_and_refuses_invalid_settings() -> None:
     model = create_model("guided")
     assert not list(model.parameters())
