@@ -345,6 +345,34 @@ def test_the_command_line_prints_and_writes_the_plan(
     assert images[0] == images[1]
 
 
+@pytest.mark.parametrize("bright", [1.0, 1e4])
+def test_clamped_light_is_told(bright: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On the screen, in denoise.json and in the report of a film: how much, at most, and in which frame."""
+    (tmp_path / "in").mkdir()
+    noise = np.random.default_rng(0).gamma(2.0, 0.5, (2, 48, 64, 1)) * np.ones(3)
+    noise[1, 20, 30] = bright
+    for number, color in enumerate(noise, 1):
+        write_exr(tmp_path / "in" / f"shot_{number}.exr", color.astype(np.float32), "RGB")
+    with pytest.raises(SystemExit) as stop:
+        main(["denoise", str(tmp_path / "in"), "-o", str(tmp_path / "out"), "--model", "oidn_tuned_small"])
+    assert not stop.value.code
+    frames = json.loads((tmp_path / "out" / "denoise.json").read_text())["frames"]
+    told = [line for line in capsys.readouterr().out.splitlines() if "fireflies" in line]
+    if bright == 1:
+        assert not told
+        return
+    # The pixel has 1e4 of the light of 3072 + 1e4 pixels, of which thirty times the mean is left.
+    assert frames["1"]["fireflies"] == 0
+    assert frames["2"]["fireflies"] == pytest.approx(1e4 / (1e4 + 3072), rel=0.02)
+    for fact in (f"{frames['2']['fireflies'] / 2:.1%}", f"{frames['2']['fireflies']:.1%}", "frame 2"):
+        assert fact in told[0]
+    (tmp_path / "film.toml").write_text('[[shot]]\nname = "a"\ninput = "in"\nmodel = "oidn_tuned_small"\n')
+    with pytest.raises(SystemExit):
+        main(["film", str(tmp_path / "film.toml"), "-o", str(tmp_path / "film"), "--workers", "1"])
+    (shot,) = json.loads((tmp_path / "film" / "film.json").read_text())["shots"]
+    assert told[0] in shot["warnings"]
+
+
 def test_a_sequence_and_its_frames_one_by_one_are_the_same(small_sequence: Path, tmp_path: Path) -> None:
     sequence = open_sequence(small_sequence)
     report = denoise_sequence(sequence, tmp_path / "out", Denoiser(small_model()), "small")

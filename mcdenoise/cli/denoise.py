@@ -23,8 +23,6 @@ from mcdenoise.shot import ShotSettings
 
 # Loading numba takes 0.9 s, which is what the shipped networks gain from it on a still of three million pixels.
 _SMALL_STILL = 1920 * 1080
-# Fraction of the light from which clamped fireflies are told.
-_TOLD = 0.01
 
 
 def denoise(
@@ -86,9 +84,8 @@ def denoise(
             shown.close(on_frame=lambda: progress.advance(task))
     for row in report.plan:
         say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
-    lost = [done.fireflies for done in report.frames.values()]
-    if max(lost, default=0) > _TOLD:
-        print(f"clamped fireflies: {sum(lost) / len(lost):.1%} of the light, at most {max(lost):.1%} of a frame's")
+    if report.clamped:
+        print(report.clamped)
     if report.replaced_pixels:
         print(f"replaced {report.replaced_pixels} NaN, infinite, negative or absurdly bright pixels of the noisy color")
     print(f"  tiles: {report.tiles}")

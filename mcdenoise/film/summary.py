@@ -65,7 +65,9 @@ def summarize(order: Order) -> Summary:
         if opened.shot.settings.preview:
             _preview(order, opened, report.files)
     described = _described(records)
-    warnings = [*opened.sequence.warnings, *(report.warnings if records else [])]
+    warnings = list(opened.sequence.warnings)
+    if records:
+        warnings += [*report.warnings, *filter(None, [report.clamped])]
     return Summary(
         report.milliseconds if records else {},
         tuple(described),
