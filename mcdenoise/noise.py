@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.ops._constants import LEAST_SUM
-from mcdenoise.ops._steps.noise import noise_sums
+from mcdenoise.ops._steps.noise import LEAST_SUM, noise_sums
 
 # Limits of the ratio of both differences. On shots of Mitsuba and Cycles, none of 104 with independent noise then has a
 # spread of more than 0.3, and 37 of 40 with Gaussian, Mitchell and tent filters have; three small ones with few even

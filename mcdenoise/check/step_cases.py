@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from mcdenoise.check import reference
-from mcdenoise.check.case import Case, Inputs, Op, Rounding, normal, uniform
+from mcdenoise.check.case import Case, Inputs, Op, normal, uniform
 from mcdenoise.check.extreme import history_rounding
 from mcdenoise.ops._steps import history, network
 
@@ -61,16 +61,8 @@ def _buffers(size: Size, g: Generator) -> Inputs:
     }
 
 
-def _input(size: Size, g: Generator) -> Inputs:
-    return {"image": _positive(size, g), "features": normal(g, size[0], 11, *size[1:])}
-
-
 def _buffers_input(size: Size, g: Generator) -> Inputs:
     return {"image": _positive(size, g), **_buffers(size, g)}
-
-
-def _guides(size: Size, g: Generator) -> Inputs:
-    return {name: value for name, value in _buffers(size, g).items() if name in ("normal", "depth", "scale")}
 
 
 def _half(size: Size) -> Size:
@@ -84,14 +76,6 @@ def _fusion(size: Size, g: Generator) -> Inputs:
         "weight": 0.3 * normal(g, 1, 6, 3, 3),
         "bias": normal(g, 1),
     }
-
-
-def _low(size: Size, g: Generator) -> Inputs:
-    return {"fine": _positive(size, g), "coarse": _positive(_half(size), g), "maximum": 20 * _factor(size, g)}
-
-
-def _planes(size: Size, g: Generator) -> Inputs:
-    return {"x": 5 * normal(g, size[0], 3, *size[1:])}
 
 
 def _entering(size: Size, g: Generator) -> Inputs:
@@ -117,22 +101,14 @@ def _history(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
     }
 
 
-def _network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -> Tensor:
-    image, features = image.double(), features.double()
-    return torch.cat([torch.log(1 + image) if logarithms else image, features], 1)
-
-
 def _normalized(depth: Tensor, scale: list[Tensor]) -> Tensor:
     near, typical = (each.double() for each in scale)
     depth = depth.double()
     return torch.where(depth.isinf(), 1, 1 - 1 / (1 + torch.where(depth.isinf(), 1, depth) / (near * typical)))
 
 
-def _network_guides(normal: Tensor, depth: Tensor, scale: list[Tensor]) -> Tensor:
-    return torch.cat([(normal.double() + 1) / 2, _normalized(depth, scale)], 1)
-
-
-def _network_features(
+def _of_buffers(
+    image: Tensor,
     albedo: Tensor,
     normal: Tensor,
     depth: Tensor,
@@ -142,20 +118,8 @@ def _network_features(
     scale: list[Tensor],
 ) -> Tensor:
     lit = torch.log(1 + current.double() * exposure.double())
-    return torch.cat([albedo.double(), _network_guides(normal, depth, scale), lit, 1 / length.double()], 1)
-
-
-def _of_buffers(image: Tensor, **buffers: Any) -> Tensor:
-    return _network_input(image, _network_features(**buffers))
-
-
-def _depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
-    near, typical = [], []
-    for image in depth.double():
-        hit = image[image.isfinite()]
-        near.append(torch.tensor(1.0) if not len(hit) else 1 / (1 / hit.sqrt()).mean() ** 2)
-        typical.append(torch.tensor(1.0) if not len(hit) else torch.exp(torch.log(hit).mean()) / near[-1])
-    return torch.stack(near).double().reshape(-1, 1, 1, 1), torch.stack(typical).double().reshape(-1, 1, 1, 1)
+    features = [albedo.double(), (normal.double() + 1) / 2, _normalized(depth, scale), lit, 1 / length.double()]
+    return torch.cat([torch.log(1 + image.double()), *features], 1)
 
 
 def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *, logarithms: bool = False) -> Tensor:
@@ -165,20 +129,6 @@ def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *,
     detail = torch.log(1 + fine) if logarithms else fine
     alpha = torch.sigmoid(F.conv2d(torch.cat([detail, wide], 1), weight, bias, padding=1))
     return detail + alpha * (wide - (torch.log(1 + low) if logarithms else low))
-
-
-def _low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor) -> Tensor:
-    fine, coarse, maximum = fine.double(), coarse.double(), maximum.double()
-    means = reference.downsample(reference.downsample(reference.downsample(fine)))
-    wanted = reference.downsample(reference.downsample(coarse))
-    wide, found = (F.interpolate(each, scale_factor=8.0, mode="bilinear") + 1e-3 for each in (wanted, means))
-    rows, columns = slice(fine.shape[-2]), slice(fine.shape[-1])
-    return torch.minimum(fine * wide[..., rows, columns] / found[..., rows, columns], torch.exp(maximum) - 1)
-
-
-def _softplus(x: Tensor, *, units: tuple[float, ...]) -> Tensor:
-    x = x.double()
-    return torch.logaddexp(x, torch.zeros_like(x)) * torch.tensor(units, dtype=torch.float64).reshape(-1, 1, 1)
 
 
 def _incoming(color: Tensor, albedo: Tensor) -> Tensor:
@@ -212,25 +162,13 @@ def _blend(
     return color, length, (length > 1).double().mean((1, 2, 3))
 
 
-def _low_rounding(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    """A pixel cancels against its own mean: the difference ``w / f - f w / f^2`` may be small beside both terms."""
-    fine, coarse = inputs["fine"], inputs["coarse"]
-    assert isinstance(fine, Tensor)
-    assert isinstance(coarse, Tensor)
-    return Rounding(gradients={"fine": torch.full_like(fine, float(coarse.max() / fine.min()))})
-
-
 _BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
 
 # Between accumulation and a network's convolutions frames are in float32, so steps need not support half precision.
 STEPS: tuple[Op, ...] = tuple(
     replace(step, half_precision=False)
     for step in (
-        Op(network.network_input, _network_input, _cases(_input, ("image", "features"))),
-        Op(network.network_features, _network_features, _cases(_buffers, _BUFFERS)),
         Op(network.buffers_input, _of_buffers, _cases(_buffers_input, ("image", *_BUFFERS))),
-        Op(network.network_guides, _network_guides, _cases(_guides, ("normal", "scale"))),
-        Op(network.depth_scale, _depth_scale, _cases(lambda size, g: {"depth": _depth(size, g)}, ())),
         # Its weights have no batch axis.
         Op(
             network.gated_fusion,
@@ -247,13 +185,6 @@ STEPS: tuple[Op, ...] = tuple(
             ),
             batched=False,
         ),
-        Op(
-            network.low_frequencies_of,
-            _low_frequencies_of,
-            _cases(_low, ("fine", "coarse")),
-            rounding=_low_rounding,
-        ),
-        Op(network.softplus, _softplus, _cases(_planes, ("x",), units=(1.0, 10.0, 1000.0))),
         Op(history.incoming, _incoming, _cases(_entering, ()), least_dtype=torch.float32),
         Op(history.lights, _lights, _cases(_root, ())),
         Op(

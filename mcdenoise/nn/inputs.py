@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.ops._steps.network import buffers_input, depth_scale, network_guides, normalized_depth
+from mcdenoise.ops._steps.network import buffers_input, depth_scale, normalized_depth
 
 FEATURES = 11  # albedo 3, normal 3, depth 1, color of the current frame 3, one over the history length 1
 
@@ -105,7 +105,7 @@ def guides_of(frame: Frame) -> list[Tensor]:
     """Normal and depth in [0, 1], the guides of bilateral weights."""
     _, normal, depth = features_of(frame)
     near, typical = frame.statistics["depth_scale"].split(1, 1)
-    return list(network_guides(normal, depth, (near, typical)).split([3, 1], 1))
+    return [normal * 0.5 + 0.5, normalized_depth(depth, near, typical)]
 
 
 def unit_features_of(frame: Frame) -> list[Tensor]:

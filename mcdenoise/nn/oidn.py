@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, convolved_in_float32, max_pool
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._steps.network import network_input
 from mcdenoise.ops._window import computing_dtype, corner, up_to_multiple
 
 Size: TypeAlias = Literal["small", "base", "large"]
@@ -110,12 +109,10 @@ class OidnUNet(nn.Module):
             than bfloat16 resolves.
         """
         height, width = x.shape[-2:]
-        if x.dtype != computing_dtype(x) or not x.is_contiguous(memory_format=torch.channels_last):
-            x = network_input(x[:, :_COLORS], x[:, _COLORS:], logarithms=False)
         # A graph for any image size cannot branch on whether padding is needed.
         if torch.compiler.is_compiling() or height % _MULTIPLE or width % _MULTIPLE:
             x = up_to_multiple(x, _MULTIPLE)
-        x = x.contiguous(memory_format=torch.channels_last)
+        x = x.to(computing_dtype(x), memory_format=torch.channels_last)
         skips = [x]
         for level, block in enumerate(self.encoder):
             x = block(x)

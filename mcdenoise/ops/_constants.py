@@ -22,11 +22,10 @@ LABEL_WEIGHT = 1e-3
 # Parameter of Keys' bicubic kernel, its slope at a distance of 1; that of torch. Catmull-Rom splines have -0.5.
 CUBIC = -0.75
 
-# Smallest sum of pixels that differences are relative to.
-LEAST_SUM = 1e-9
-
 # Smallest lag as a fraction of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST_LAG = 1e-3
+# Side of the window of means that are compared, in pixels.
+LAG_WINDOW = 5
 # For a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how
 # many equally weighted frames have its noise once it is full, (2 - alpha) / alpha.
 RECENT_ALPHA, RECENT_FRAMES = 0.25, 7
@@ -37,11 +36,8 @@ STILL = 0.05
 # light is lost to that.
 EVEN, BRIGHTER, LIGHT_WINDOW = 0.03, 1.2, 9
 
-# Side of the blocks whose means are an image's low frequencies, in pixels. Below this fraction of a typical radiance
-# they are left alone.
-BLOCK, DARK = 8, 1e-3
-# The least number that a depth counts as, and how many near depths away the scene ends.
-SHORTEST, FARTHEST = 1e-30, 1e4
+# The least number that a depth counts as.
+SHORTEST = 1e-30
 
 # The epsilon of SVGF's Eq. 3, which the paper leaves open, as a fraction of the depth: the precision of depths in half
 # floats. The others keep quotients and their derivatives finite, where `exp` of them is zero in any precision.
@@ -64,22 +60,3 @@ PU_BRIGHT = (1.92653254e-01, 6.26026094e-03, 9.98620152e-01)
 PU_JOINTS = (1.57945760e-06, 3.22087631e-02, 2.23151711e-03, 3.70974749e-01)
 MAX_RADIANCE = 65504.0
 PU_WHITE = PU_BRIGHT[0] * math.log(MAX_RADIANCE + PU_BRIGHT[1]) + PU_BRIGHT[2]
-
-# Where what a denoiser removed is correlated, it is detail. Statistics are means over windows of CELLS x CELLS cells
-# of CELL x CELL pixels. Over LAG pixels noise is uncorrelated, also under a Gaussian pixel filter. A correlation counts
-# as far as it exceeds DEVIATIONS standard deviations; GAIN is the weight per correlation, because detail is correlated
-# only in part over the lag. Differences are relative to a mean of at least LEAST_MEAN times the window's.
-CELL, CELLS, LAG = 4, 7, 2
-DEVIATIONS, GAIN, LEAST_MEAN = 3.0, 4.0, 0.1
-# Smallest mean and largest relative difference, so that all derivatives are finite; and smallest variance and power.
-DARKEST, MOST = 1e-15, 1e4
-LEAST_VARIANCE, LEAST_POWER = 1e-30, 1e-12
-
-# The noise of an image is told from the pixels of rows and columns at the distance EVERY. Smallest albedo to divide by,
-# and largest radiance. Where a feature changes by EVEN_FEATURE from pixel to pixel, differences may be those of the
-# scene: their weight is UNEVEN. Smaller differences than ROUNDED are rounding errors; edges and fireflies, which are
-# larger than LARGE_DIFFERENCE, should not outweigh the rest. Fourth differences of independent noise of variance 1 have
-# the variance 70, second differences 6.
-EVERY, DARKEST_ALBEDO, BRIGHTEST = 8, 0.02, 1e16
-EVEN_FEATURE, UNEVEN, ROUNDED, LARGE_DIFFERENCE = 0.02, 0.01, 1e-6, 0.1
-FOURTH = math.sqrt(70 / 6)

@@ -30,14 +30,13 @@ _Result = TypeVar("_Result")
 
 
 def op(
-    *backends: Backend, check: Callable[..., None] | None = None, differentiable: bool = False
+    *backends: Backend, check: Callable[..., None] | None = None
 ) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
     """Make an op of its plain implementation.
 
     Args:
         backends: names of its fast backends.
         check: takes the arguments of the op, and raises for those that its contract refuses; run before any backend.
-        differentiable: has no effect.
     """
 
     def decorate(plain: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:

@@ -7,12 +7,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._constants import SMALLEST_LAG
+from mcdenoise.ops._constants import LAG_WINDOW, SMALLEST_LAG
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
 
 THRESHOLD = 2.0
-KERNEL_SIZE = 5
+KERNEL_SIZE = LAG_WINDOW
 
 
 def history_lag(

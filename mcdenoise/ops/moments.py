@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average, layouts
+from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype
 
@@ -107,27 +108,6 @@ def moments_variance(
     return (torch.where(difference > 0, difference, 0) / scale).to(moments.dtype)
 
 
-class MomentsVariance(nn.Module):
-    """:func:`moments_variance` with its settings stored.
-
-    Args:
-        kernel_size: see :func:`moments_variance`.
-        sigma_z: see :func:`moments_variance`.
-        sigma_n: see :func:`moments_variance`.
-    """
-
-    def __init__(self, kernel_size: int = 1, sigma_z: float = SIGMA_Z, sigma_n: float = SIGMA_N) -> None:
-        super().__init__()
-        _check_settings(kernel_size, sigma_z, sigma_n)
-        self.kernel_size, self.sigma_z, self.sigma_n = kernel_size, sigma_z, sigma_n
-
-    def forward(self, moments: Tensor, normal: Tensor | None = None, depth: Tensor | None = None) -> Tensor:
-        """See :func:`moments_variance`."""
-        return moments_variance(
-            moments, normal, depth, kernel_size=self.kernel_size, sigma_z=self.sigma_z, sigma_n=self.sigma_n
-        )
-
-
 def luminance(light: Tensor) -> Tensor:
     """``(B, 1, H, W)`` of ``(B, 3, H, W)``."""
     red, green, blue = (weight * channel for weight, channel in zip(LUMINANCE, light.split(1, 1), strict=True))
@@ -139,3 +119,6 @@ def _check_settings(kernel_size: int, sigma_z: float, sigma_n: float) -> None:
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise ValueError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
     check_sigmas(sigma_z, sigma_n)
+
+
+MomentsVariance = module_of("MomentsVariance", moments_variance, _check_settings)

@@ -23,11 +23,6 @@ __all__ = [
 ]
 
 
-def _check_motion(position: Tensor, previous_view_projection: Tensor) -> None:
-    check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
-
-
-@op("numba", check=_check_motion)
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """The motion of each point of a static surface: its place in the previous frame minus its place now.
 
@@ -56,6 +51,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
         >>> motion_from_position(position, torch.eye(4)[None]).flatten().tolist()  # u = 0.75 of one pixel
         [0.25, 0.0]
     """
+    check_shapes(position=(position, "B 3 H W"), previous_view_projection=(previous_view_projection, "B 4 4"))
     height, width = position.shape[-2:]
     dtype = torch.promote_types(position.dtype, torch.float32)
     matrix = previous_view_projection.to(dtype)
@@ -225,7 +221,7 @@ def check_accumulate(
     check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
 
 
-@op("numba", check=check_accumulate, differentiable=True)
+@op("numba", check=check_accumulate)
 def accumulate(
     color: Tensor,
     previous: Tensor,

@@ -99,7 +99,6 @@ def passed(
     window: int = 7,
     specular_length: float = 2,
     lag_threshold: float = 2.0,
-    lag_kernel_size: int = 5,
     still: bool = False,
 ) -> list[Past]:
     """Every frame of a shot with its past."""
@@ -129,7 +128,6 @@ def passed(
                     albedo=frame.albedo,
                     specular_length=specular_length,
                     lag_threshold=lag_threshold,
-                    lag_kernel_size=lag_kernel_size,
                 )
         before = Surface(position, frame.normal, depth, seen)
         results.append(Past(history[:, steps.COLOR].clone(), entering[:, steps.COLOR], length.clone(), kept))
@@ -176,8 +174,7 @@ def test_the_history_is_that_of_the_reference(way: str, rule: dict[str, Any]) ->
     "settings",
     [
         {"lag_threshold": math.inf},
-        {"lag_threshold": 0.1, "lag_kernel_size": 3},
-        {"lag_threshold": 1.0, "lag_kernel_size": 9},
+        {"lag_threshold": 0.1},
         {"specular_length": 0},
         {"specular_length": math.inf},
         {"limit": math.inf},

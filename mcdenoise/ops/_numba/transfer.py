@@ -9,7 +9,6 @@ from torch import Tensor
 
 from mcdenoise.ops._constants import MAX_RADIANCE, PU_BRIGHT, PU_DARK, PU_JOINTS, PU_MIDDLE, PU_WHITE
 from mcdenoise.ops._numba._runtime import compiled, exp, log, read_row, share_rows, source
-from mcdenoise.ops._operator import custom_op
 
 _B, _C, _D = PU_MIDDLE
 _E, _F, _G = PU_BRIGHT
@@ -18,40 +17,22 @@ _Y0, _Y1, _X0, _X1 = PU_JOINTS
 
 def compress(radiance: Tensor) -> Any:
     """See :func:`mcdenoise.ops._steps.transfer.compress`."""
-    return _compress(radiance) if _is_supported(radiance) else NotImplemented
+    return _mapped(radiance, _compress_rows)
 
 
 def expand(compressed: Tensor) -> Any:
     """See :func:`mcdenoise.ops._steps.transfer.expand`."""
-    return _expand(compressed) if _is_supported(compressed) else NotImplemented
-
-
-def _is_supported(image: Tensor) -> bool:
-    return image.ndim == 4 and image.dtype in (torch.float32, torch.float64)
-
-
-@custom_op("mcdenoise::compress", device_types="cpu", schema="(Tensor radiance) -> Tensor")
-def _compress(radiance: Tensor) -> Tensor:
-    return _mapped(radiance, _compress_rows)
-
-
-@custom_op("mcdenoise::expand", device_types="cpu", schema="(Tensor compressed) -> Tensor")
-def _expand(compressed: Tensor) -> Tensor:
     return _mapped(compressed, _expand_rows)
 
 
-def _mapped(image: Tensor, rows: Any) -> Tensor:
-    result = _empty_planes(image)
+def _mapped(image: Tensor, rows: Any) -> Any:
+    if image.ndim != 4 or image.dtype not in (torch.float32, torch.float64):
+        return NotImplemented
+    result = torch.empty(image.shape, dtype=image.dtype, device="cpu")
     if result.numel():
         arguments = (result.numpy(), source(image))
         share_rows(image, lambda *span: rows(*arguments, *span), light=True)
     return result
-
-
-@_compress.register_fake
-@_expand.register_fake
-def _empty_planes(image: Tensor) -> Tensor:
-    return image.new_empty(image.shape)
 
 
 @compiled

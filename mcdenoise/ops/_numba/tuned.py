@@ -12,7 +12,6 @@ from torch import Tensor
 from mcdenoise.ops._numba._runtime import compiled, exp, read_row, share_rows, source
 from mcdenoise.ops._numba.network import CHUNK, interleave, round_row
 from mcdenoise.ops._numba.transfer import compress_values, expand_values
-from mcdenoise.ops._operator import custom_op
 from mcdenoise.ops._window import computing_dtype
 
 
@@ -31,17 +30,30 @@ def tuned_input(
     # A single number that is read for every pixel.
     albedo = color.new_ones(1, 1, 1, 1).expand_as(color) if albedo is None else albedo
     normal = color.new_zeros(1, 1, 1, 1).expand_as(color) if normal is None else normal
-    images = (color, before, light, albedo, normal, valid)
-    if dtype == torch.float16 or not _are_alike(*images, exposure):
+    buffers = (color, before, light, albedo, normal, valid, exposure.expand(len(color), 1, 1, 1))
+    if dtype == torch.float16 or not _are_alike(*buffers):
         return NotImplemented
-    return _tuned_input(*images, exposure.expand(len(color), 1, 1, 1), multiple, dtype)
+    batch, _, height, width = color.shape
+    rows, columns = (-(-side // multiple) * multiple for side in (height, width))
+    seen = torch.empty((batch, 16, rows, columns), dtype=dtype, memory_format=torch.channels_last, device="cpu")
+    seen[..., height:, :], seen[..., width:] = 0, 0
+    images = torch.empty((batch, 9, height, width), dtype=color.dtype, device="cpu")
+    if images.numel():
+        arguments = (source(seen), images.numpy(), *map(source, buffers))
+        share_rows(color, lambda *rows: _input_rows(*arguments, *rows))
+    return seen, images
 
 
 def tuned_choice(predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]) -> Any:
     """See :func:`mcdenoise.ops._steps.tuned.tuned_choice`."""
-    if not _are_alike(predicted, images, valid, exposure):
+    read = (predicted, images, valid, exposure.expand(len(images), 1, 1, 1))
+    if not _are_alike(*read):
         return NotImplemented
-    return _tuned_choice(predicted, images, valid, exposure.expand(len(images), 1, 1, 1), list(offsets))
+    result = torch.empty((len(images), 3, *images.shape[2:]), dtype=images.dtype, device="cpu")
+    if result.numel():
+        arguments = (result.numpy(), *map(source, read), np.array(offsets, result.numpy().dtype))
+        share_rows(images, lambda *rows: _choice_rows(*arguments, *rows))
+    return result
 
 
 def _are_alike(*images: Tensor) -> bool:
@@ -49,36 +61,6 @@ def _are_alike(*images: Tensor) -> bool:
     first, dtype = images[0], images[0].dtype
     same_size = all((len(image), *image.shape[2:]) == (len(first), *first.shape[2:]) for image in images[:-1])
     return dtype in (torch.float32, torch.float64) and all(image.dtype == dtype for image in images) and same_size
-
-
-@custom_op(
-    "mcdenoise::tuned_input",
-    device_types="cpu",
-    schema="(Tensor color, Tensor before, Tensor light, Tensor albedo, Tensor normal, Tensor valid, Tensor exposure, "
-    "int multiple, ScalarType dtype) -> (Tensor, Tensor)",
-)
-def _tuned_input(color: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
-    seen, images = _empty_input(color, *others)
-    height, width = color.shape[2:]
-    seen[..., height:, :], seen[..., width:] = 0, 0
-    if images.numel():
-        *buffers, _, _ = others
-        read = tuple(source(image) for image in (color, *buffers))
-        target, scaled = source(seen), images.numpy()
-        share_rows(color, lambda *rows: _input_rows(target, scaled, *read, *rows))
-    return seen, images
-
-
-@_tuned_input.register_fake
-def _empty_input(color: Tensor, *others: Any) -> tuple[Tensor, Tensor]:
-    *buffers, _, multiple, dtype = others
-    batch, _, height, width = color.shape
-    channels = sum(image.shape[1] for image in (color, *buffers))
-    rows, columns = (-(-side // multiple) * multiple for side in (height, width))
-    seen = torch.empty(
-        (batch, channels, rows, columns), dtype=dtype, device=color.device, memory_format=torch.channels_last
-    )
-    return seen, color.new_empty(batch, 9, height, width)
 
 
 @compiled
@@ -134,27 +116,6 @@ def _scaled(row: Any, image: Any, b: int, c: int, y: int, x0: int, factor: Any) 
     for x in range(row.size):
         row[x] *= factor
     compress_values(row)
-
-
-@custom_op(
-    "mcdenoise::tuned_choice",
-    device_types="cpu",
-    schema="(Tensor predicted, Tensor images, Tensor valid, Tensor exposure, float[] offsets) -> Tensor",
-)
-def _tuned_choice(
-    predicted: Tensor, images: Tensor, valid: Tensor, exposure: Tensor, offsets: Sequence[float]
-) -> Tensor:
-    result = _empty_choice(predicted, images, valid, exposure, offsets)
-    if result.numel():
-        read = tuple(source(image) for image in (predicted, images, valid, exposure))
-        out, added = result.numpy(), np.array(offsets, result.numpy().dtype)
-        share_rows(images, lambda *rows: _choice_rows(out, *read, added, *rows))
-    return result
-
-
-@_tuned_choice.register_fake
-def _empty_choice(_: Tensor, images: Tensor, *others: Any) -> Tensor:
-    return images.new_empty(images.shape[0], 3, *images.shape[2:])
 
 
 @compiled

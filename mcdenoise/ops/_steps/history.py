@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -21,12 +20,10 @@ from mcdenoise.ops._constants import (
 )
 from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended
 from mcdenoise.ops._op import op, plain
-from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._surface import Rule, Surface
 from mcdenoise.ops._window import corner
 from mcdenoise.ops.demodulation import demodulate
 from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
-from mcdenoise.ops.lag import KERNEL_SIZE as LAG_KERNEL_SIZE
 from mcdenoise.ops.lag import history_lag
 from mcdenoise.ops.temporal import accumulate, check_accumulate
 
@@ -81,13 +78,9 @@ def incoming(
     Returns:
         ``(B, 5, H, W)``, or ``(B, 3, H, W)`` without the two; at least float32, in which half precision is computed.
     """
-
-    def clamped(color: Tensor, albedo: Tensor | None = None) -> Tensor:
-        color = color.to(torch.promote_types(color.dtype, torch.float32))
-        color = color if albedo is None else demodulate(color, albedo)
-        return clamp_fireflies(color, limit=limit, kernel_size=kernel_size)
-
-    color = by_rows(clamped, color, *(() if albedo is None else (albedo,)), reach=kernel_size // 2)
+    color = color.to(torch.promote_types(color.dtype, torch.float32))
+    color = color if albedo is None else demodulate(color, albedo)
+    color = clamp_fireflies(color, limit=limit, kernel_size=kernel_size)
     if not compared:
         return color
     root = color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
@@ -111,10 +104,7 @@ def lights(root: Tensor) -> Tensor:
     Returns:
         ``(B, 1, H, W)`` of 0 and 1 in the dtype of ``root``; no derivative.
     """
-    return by_rows(_lights, root.detach(), reach=LIGHT_WINDOW // 2)
-
-
-def _lights(root: Tensor) -> Tensor:
+    root = root.detach()
     if min(root.shape[-2:]) < 3 or root.numel() == 0:
         return torch.zeros_like(root)
     largest, smallest = F.max_pool2d(root, 3, 1), -F.max_pool2d(-root, 3, 1)
@@ -151,7 +141,6 @@ def _check_blend(
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
-    lag_kernel_size: int = LAG_KERNEL_SIZE,
 ) -> None:
     if not specular_length >= 0:
         raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
@@ -186,7 +175,6 @@ def blend(
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
-    lag_kernel_size: int = LAG_KERNEL_SIZE,
 ) -> Blended:
     """Accumulate a frame, with a shorter history where that is known to be wrong.
 
@@ -215,7 +203,6 @@ def blend(
         albedo: ``(B, 3, H, W)``, which says where mirrors and glass are; without it no history is shortened for them.
         specular_length: in frames, at least 0.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test.
-        lag_kernel_size: see :func:`mcdenoise.ops.history_lag`, in half the resolution.
 
     Returns:
         See :class:`Blended`; the dtypes of ``entering`` and of ``previous_length``.
@@ -237,14 +224,9 @@ def blend(
     pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels
     if albedo is not None and motion is not None and specular_length < math.inf:
-        shorten = partial(_shortened, specular_length + 1, alpha_min)
-        result = by_rows(shorten, both, color, length, albedo, motion)
-        color, length = result[:, :-1], result[:, -1:]
+        color, length = _shortened(specular_length + 1, alpha_min, both, color, length, albedo, motion)
     if tests:
-        # Pairs of rows stay together.
-        give_up = partial(_without_lag, lag_threshold, lag_kernel_size, alpha_min, recent_alpha)
-        result = by_rows(give_up, both, color, length, reach=2 * (lag_kernel_size // 2))
-        color, length = result[:, :-1], result[:, -1:]
+        color, length = _without_lag(lag_threshold, alpha_min, recent_alpha, both, color, length)
     return Blended(color, length.to(previous_length.dtype), kept)
 
 
@@ -255,7 +237,7 @@ def _weight_of_history(length: Tensor, alpha_min: float) -> Tensor:
 
 def _shortened(
     longest: float, alpha_min: float, color: Tensor, blended: Tensor, length: Tensor, albedo: Tensor, motion: Tensor
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """Color and length if the history of mirrors and glass that move is no longer than that."""
     # A reduction over the channels takes a hundred times as long.
     # No hypot, which graphs in ONNX do not have.
@@ -265,18 +247,12 @@ def _shortened(
     weight = _weight_of_history(length.clamp_max(longest), alpha_min)
     weight = weight / _weight_of_history(length, alpha_min).clamp_min(1e-6)
     shortened = torch.lerp(color, blended, weight.to(color.dtype))
-    return torch.cat([torch.where(too_long, shortened, blended), torch.where(too_long, longest, length)], 1)
+    return torch.where(too_long, shortened, blended), torch.where(too_long, longest, length)
 
 
 def _without_lag(
-    threshold: float,
-    kernel_size: int,
-    alpha_min: float,
-    recent_alpha: float,
-    color: Tensor,
-    blended: Tensor,
-    length: Tensor,
-) -> Tensor:
+    threshold: float, alpha_min: float, recent_alpha: float, color: Tensor, blended: Tensor, length: Tensor
+) -> tuple[Tensor, Tensor]:
     """Color and length without lag: the frame corrects the recent history, and the recent history the long one."""
     mean, square = blended[:, MEAN], blended[:, SQUARE]
     counted = length.clamp_min(2)
@@ -284,20 +260,19 @@ def _without_lag(
     # Accumulated with the long one's weight of the frame, which is the smaller one.
     weight = _weight_of_history(length, recent_alpha) / _weight_of_history(length, alpha_min).clamp_min(1e-6)
     recent = torch.lerp(color[:, RECENT], blended[:, RECENT], weight)
-    lag = partial(_lag, threshold, kernel_size)
-    recent = torch.lerp(recent, color[:, RECENT], lag(recent[:, 3:], color[:, RECENT_MEAN], variance))
-    given_up = lag(mean, recent[:, 3:], variance / length.clamp_max(RECENT_FRAMES))
+    recent = torch.lerp(recent, color[:, RECENT], _lag(threshold, recent[:, 3:], color[:, RECENT_MEAN], variance))
+    given_up = _lag(threshold, mean, recent[:, 3:], variance / length.clamp_max(RECENT_FRAMES))
     shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
     longer = torch.lerp(blended[:, : RECENT.start], shorter, given_up)
-    return torch.cat([longer, recent, torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)], 1)
+    return torch.cat([longer, recent], 1), torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)
 
 
-def _lag(threshold: float, kernel_size: int, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
+def _lag(threshold: float, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
     """The test in half the resolution, for a quarter of the time: a window holds as many pixels, in blocks of four."""
     height, width = history.shape[-2:]
     halves = (
         F.avg_pool2d(image.detach(), 2, ceil_mode=True, count_include_pad=False)
         for image in (history, recent, variance / 4)
     )
-    lag = history_lag(*halves, threshold=threshold, kernel_size=kernel_size)
+    lag = history_lag(*halves, threshold=threshold)
     return corner(lag.repeat_interleave(2, -2).repeat_interleave(2, -1), height, width)

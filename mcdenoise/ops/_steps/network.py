@@ -8,10 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._constants import BLOCK, DARK, FARTHEST, SHORTEST
+from mcdenoise.ops._constants import SHORTEST
 from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._op import op, plain
-from mcdenoise.ops._rows import by_rows
+from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype, corner
 from mcdenoise.ops.fusion import downsample, laplacian_fusion, upsample
 
@@ -21,27 +20,15 @@ __all__ = [
     "depth_scale",
     "gated_fusion",
     "low_frequencies_of",
-    "network_features",
-    "network_guides",
-    "network_input",
     "normalized_depth",
     "softplus",
 ]
 
-
-@op("numba")
-def network_input(image: Tensor, features: Tensor, *, logarithms: bool = True) -> Tensor:
-    """``torch.cat([torch.log1p(image), features], 1)`` as a convolution takes it: channels-last, precision of autocast.
-
-    Args:
-        image: ``(B, C, H, W)`` radiance; or logarithms of radiance already.
-        features: ``(B, F, H, W)`` of the same dtype.
-        logarithms: whether to take them.
-
-    Returns:
-        ``(B, C + F, H, W)``. The reference implementation leaves layout and precision to the convolution.
-    """
-    return torch.cat([torch.log1p(image) if logarithms else image, features], 1)
+# Side of the blocks whose means are an image's low frequencies, in pixels. Below this fraction of a typical radiance
+# they are left alone.
+BLOCK, DARK = 8, 1e-3
+# How many near depths away the scene ends.
+FARTHEST = 1e4
 
 
 @op("numba")
@@ -56,48 +43,31 @@ def buffers_input(
     scale: tuple[Tensor, Tensor],
     *,
     logarithms: bool = True,
-    image_factor: Tensor | None = None,
 ) -> Tensor:
-    """An image and its buffers as a convolution takes them: channels-last, precision of autocast.
-
-    ``network_input(image * image_factor, network_features(albedo, normal, ...))``, without the features on the way.
+    """An image and its buffers, each in a range from 0 to about 1.
 
     Args:
         image: ``(B, 3, H, W)`` radiance; or logarithms of radiance already.
-        albedo: see :func:`network_features`.
-        normal: see :func:`network_features`.
-        depth: see :func:`network_features`.
-        current: see :func:`network_features`.
-        length: see :func:`network_features`.
-        exposure: see :func:`network_features`.
-        scale: see :func:`network_features`.
-        logarithms: whether to take those of the image.
-        image_factor: ``(B, 1, 1, 1)`` factor of the image, before any logarithm; 1 by default.
-
-    Returns:
-        ``(B, 14, H, W)``: the image, then the features. The reference leaves layout and precision to the convolution.
-    """
-    features = plain(network_features)(albedo, normal, depth, current, length, exposure, scale)
-    image = image if image_factor is None else image * image_factor
-    return plain(network_input)(image, features, logarithms=logarithms)
-
-
-@op("numba")
-def network_guides(normal: Tensor, depth: Tensor, scale: tuple[Tensor, Tensor]) -> Tensor:
-    """Normal and depth as :func:`network_features` has them, to guide a filter.
-
-    Args:
+        albedo: ``(B, 3, H, W)`` in [0, 1].
         normal: ``(B, 3, H, W)`` in [-1, 1].
         depth: ``(B, 1, H, W)`` distance, ``inf`` where nothing was hit.
+        current: ``(B, 3, H, W)`` radiance.
+        length: ``(B, 1, H, W)`` at least 1; 1 by default.
+        exposure: ``(B, 1, 1, 1)`` factor of the current radiance.
         scale: of :func:`depth_scale`.
+        logarithms: whether to take those of the image.
 
     Returns:
-        ``(B, 4, H, W)``: ``normal / 2 + 1 / 2``, and :func:`normalized_depth`.
+        ``(B, 14, H, W)``: the logarithm of the image; albedo, normal, depth, logarithm of the current radiance, and one
+        over the length. The fast backend writes it as a convolution takes it: channels-last, in the precision of
+        autocast.
     """
-    return torch.cat([normal * 0.5 + 0.5, normalized_depth(depth, *scale)], 1)
+    image = torch.log1p(image) if logarithms else image
+    fraction = torch.ones_like(depth) if length is None else 1 / length
+    guides = normal * 0.5 + 0.5, normalized_depth(depth, *scale)
+    return torch.cat([image, albedo, *guides, torch.log1p(current * exposure), fraction], 1)
 
 
-@op("numba")
 def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
     """A near depth as the unit of depths, and the typical depth in that unit: the geometric mean of all hits.
 
@@ -113,29 +83,15 @@ def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
         tell nothing of the near depth, and none counts as less than 1e-30 of it. The near depth is a mere unit and has
         no derivative.
     """
-    dtype = accumulator_dtype(depth.dtype)
-
-    def totals(values: Tensor, count: Tensor) -> Tensor:
-        """Sums of the values of each row, and how many they are."""
-        return torch.cat([values.sum(-1, keepdim=True), count.sum(-1, keepdim=True).to(values.dtype)], 1)
-
-    def mean(rows: Tensor) -> Tensor:
-        total, count = rows.sum((2, 3), keepdim=True).unbind(1)
-        return (total / count.clamp_min(1))[:, None]
-
-    def roots(rows: Tensor) -> Tensor:
-        rows = rows.detach().to(dtype)
-        counts = torch.isfinite(rows) & (rows >= SHORTEST)
-        return totals(torch.where(counts, torch.where(counts, rows, 1).rsqrt(), 0), counts)
-
-    def logarithms(rows: Tensor) -> Tensor:
-        in_units = _in_units(rows, near)
-        counts = torch.isfinite(rows) & (in_units <= FARTHEST)
-        return totals(torch.where(counts, torch.log(in_units), 0), counts)
-
-    root = mean(by_rows(roots, depth))
+    depth = depth.to(accumulator_dtype(depth.dtype))
+    known = depth.detach()
+    known = torch.where((known >= SHORTEST) & (known < torch.inf), known, torch.inf)
+    root = known.rsqrt().sum((1, 2, 3), keepdim=True) / (known < torch.inf).sum((1, 2, 3), keepdim=True).clamp_min(1)
     near = torch.where(root > 0, 1 / torch.where(root > 0, root, 1).square(), 1)
-    return near, torch.exp(mean(by_rows(logarithms, depth)))
+    in_units = (depth / near).clamp_min(SHORTEST)
+    counts = in_units <= FARTHEST
+    total = torch.log(torch.where(counts, in_units, 1)).sum((1, 2, 3), keepdim=True)
+    return near, torch.exp(total / counts.sum((1, 2, 3), keepdim=True).clamp_min(1))
 
 
 def _in_units(depth: Tensor, near: Tensor) -> Tensor:
@@ -148,35 +104,6 @@ def normalized_depth(depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
     """``d / (d + typical d)`` with :func:`depth_scale`, and 1 where nothing was hit."""
     in_units = _in_units(depth, near)
     return torch.where(torch.isfinite(depth), in_units / (in_units + typical), 1).to(depth.dtype)
-
-
-@op("numba")
-def network_features(
-    albedo: Tensor,
-    normal: Tensor,
-    depth: Tensor,
-    current: Tensor,
-    length: Tensor | None,
-    exposure: Tensor,
-    scale: tuple[Tensor, Tensor],
-) -> Tensor:
-    """Buffers as a network sees them, each in a range from 0 to about 1.
-
-    Args:
-        albedo: ``(B, 3, H, W)`` in [0, 1].
-        normal: ``(B, 3, H, W)`` in [-1, 1].
-        depth: ``(B, 1, H, W)`` distance, ``inf`` where nothing was hit.
-        current: ``(B, 3, H, W)`` radiance.
-        length: ``(B, 1, H, W)`` at least 1; 1 by default.
-        exposure: ``(B, 1, 1, 1)`` factor of the radiance.
-        scale: of :func:`depth_scale`.
-
-    Returns:
-        ``(B, 11, H, W)``: albedo, normal, depth, logarithm of the radiance, and one over the length.
-    """
-    fraction = torch.ones_like(depth) if length is None else 1 / length
-    near = normalized_depth(depth, *scale)
-    return torch.cat([albedo, normal * 0.5 + 0.5, near, torch.log1p(current * exposure), fraction], 1)
 
 
 @op("numba")
@@ -229,7 +156,6 @@ def gated_fusion(
     return fused if maximum is None else torch.expm1(torch.minimum(fused.clamp_min(0), maximum))
 
 
-@op("numba")
 def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: Tensor | None = None) -> Tensor:
     """An image with the means of another in the place of its own, over blocks of 8x8 pixels.
 
@@ -255,7 +181,6 @@ def low_frequencies_of(fine: Tensor, coarse: Tensor, maximum: Tensor, exposure: 
     return torch.minimum(fine * (wanted / found), most)
 
 
-@op("numba")
 def softplus(x: Tensor, units: Sequence[float]) -> Tensor:
     """``F.softplus(x)`` in units of its own for each channel, as contiguous planes of at least float32.
 

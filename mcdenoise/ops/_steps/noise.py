@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._constants import (
-    BRIGHTEST,
-    DARKEST_ALBEDO,
-    EVEN_FEATURE,
-    EVERY,
-    FOURTH,
-    LARGE_DIFFERENCE,
-    LEAST_SUM,
-    ROUNDED,
-    UNEVEN,
-)
-from mcdenoise.ops._op import op
+# Only the pixels of rows and columns at this distance are read.
+EVERY = 8
+# Smallest albedo to divide by, largest radiance, and smallest sum of pixels that differences are relative to.
+DARKEST_ALBEDO, BRIGHTEST, LEAST_SUM = 0.02, 1e16, 1e-9
+# Where a feature changes by EVEN_FEATURE from pixel to pixel, differences may be those of the scene: their weight is
+# UNEVEN. Smaller differences than ROUNDED are rounding errors; edges and fireflies, which are larger than
+# LARGE_DIFFERENCE, should not outweigh the rest.
+EVEN_FEATURE, UNEVEN, ROUNDED, LARGE_DIFFERENCE = 0.02, 0.01, 1e-6, 0.1
+# Fourth differences of independent noise of variance 1 have the variance 70, second differences 6.
+FOURTH = math.sqrt(70 / 6)
 
 
-@op("numba")
 def noise_sums(color: Tensor, albedo: Tensor | None, normal: Tensor | None, least: float) -> Tensor:
     """Sums over the pixels of every eighth row, and of every eighth column.
 

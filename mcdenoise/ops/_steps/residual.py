@@ -6,30 +6,25 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._constants import (
-    CELL,
-    CELLS,
-    DARKEST,
-    DEVIATIONS,
-    GAIN,
-    LAG,
-    LEAST_MEAN,
-    LEAST_POWER,
-    LEAST_VARIANCE,
-    MOST,
-)
-from mcdenoise.ops._op import op
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops._window import pad
 
 __all__ = ["CELL", "REACH", "weight_of_noisy"]
 
+# Statistics are means over windows of CELLS x CELLS cells of CELL x CELL pixels. Over LAG pixels noise is uncorrelated,
+# also under a Gaussian pixel filter. A correlation counts as far as it exceeds DEVIATIONS standard deviations; GAIN is
+# the weight per correlation, because detail is correlated only in part over the lag. Differences are relative to a mean
+# of at least LEAST_MEAN times the window's.
+CELL, CELLS, LAG = 4, 7, 2
+DEVIATIONS, GAIN, LEAST_MEAN = 3.0, 4.0, 0.1
+# Smallest mean and largest relative difference, so that all derivatives are finite; and smallest variance and power.
+DARKEST, MOST = 1e-15, 1e4
+LEAST_VARIANCE, LEAST_POWER = 1e-30, 1e-12
 # Interpolation and window, twice because of the mean that differences are relative to, and the lag. It is a multiple of
 # a cell, so that bands of rows have the cells of the whole image.
 REACH = 2 * (CELL + 1 + CELLS // 2 * CELL) + LAG
 
 
-@op("numba")
 def weight_of_noisy(color: Tensor, image: Tensor) -> Tensor:
     """Weight of the noisy color beside the denoised image, see :class:`mcdenoise.models.Restored` for its equation.
 
