@@ -155,7 +155,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}, {"alpha_min": 1.0}], ids=str)
+@pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}], ids=str)
 def test_the_history_is_that_of_the_reference(way: str, rule: dict[str, Any]) -> None:
     frames = WAYS[way]
     if "rule" in rule and (frames[0].normal is None or frames[0].position is None):
@@ -183,10 +183,9 @@ def test_the_history_is_that_of_the_reference(way: str, rule: dict[str, Any]) ->
     ],
     ids=str,
 )
-@pytest.mark.parametrize("rule", [{}, BMFR], ids=str)
-def test_settings(settings: dict[str, Any], rule: dict[str, Any]) -> None:
+def test_settings(settings: dict[str, Any]) -> None:
     frames = WAYS["motion"]
-    assert_same(passed(frames, "numba", rule, **settings), passed(frames, "torch", rule, **settings), 1e-9)
+    assert_same(passed(frames, "numba", **settings), passed(frames, "torch", **settings), 1e-9)
 
 
 @pytest.mark.parametrize("way", ["nothing", "motion"])
@@ -317,46 +316,6 @@ def test_lights(size: tuple[int, int]) -> None:
     for strided in (root, transposed(root), every_other_column(root)):
         for backend in ("numba", "torch"):
             assert torch.equal(by(backend, steps.lights)(strided), expected)
-
-
-def step(
-    color: Tensor,
-    albedo: Tensor,
-    limit: Tensor,
-    history: Tensor,
-    length: Tensor,
-    motion: Tensor,
-    position: Tensor,
-    normal: Tensor,
-    depth: Tensor,
-) -> tuple[Tensor, ...]:
-    """One frame of a history, with itself as the surface before."""
-    entering = steps.incoming(color, albedo, limit)
-    surface = Surface(position, normal, depth, steps.lights(entering[:, steps.MEAN]))
-    settings = {"albedo": albedo, "specular_length": 2, "lag_threshold": 2.0}
-    return tuple(steps.blend(entering, history, length, motion, surface, surface, **settings))
-
-
-class Step(torch.nn.Module):
-    def forward(self, *images: Tensor) -> tuple[Tensor, ...]:
-        return step(*images)
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_step_is_traced_without_a_break() -> None:
-    frames = [Picture(*(None if image is None else image.float() for image in frame)) for frame in WAYS["two images"]]
-    history = steps.without_history(steps.incoming(frames[3].color, frames[3].albedo))
-    names = ("motion", "position", "normal", "depth")
-    buffers = [getattr(frames[4], name) for name in names]
-    limit, length = torch.tensor([15.0, 120.0]).reshape(2, 1, 1, 1), torch.full_like(history[:, :1], 5.0)
-    images = (frames[4].color, frames[4].albedo, limit, history, length, *buffers)
-    expected = step(*images)
-    assert expected[1].unique().numel() > 2
-    torch.compiler.reset()
-    exported = torch.export.export(Step(), images).module()
-    for traced in (torch.compile(step, fullgraph=True, backend="aot_eager"), exported):
-        for result, plain in zip(traced(*images), expected, strict=True):
-            torch.testing.assert_close(result, plain)
 
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])
