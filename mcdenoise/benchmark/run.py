@@ -82,6 +82,11 @@ class Settings:
         check_device(self.device)
 
     @property
+    def timed_sizes(self) -> list[Size]:
+        """The sizes; none if only errors are measured."""
+        return list(self.sizes) if self.rounds else []
+
+    @property
     def load(self) -> tuple[int, str]:
         """The background load, as arguments of :func:`mcdenoise.benchmark.machine.busy_machine`."""
         return self.busy, self.beside
@@ -126,54 +131,55 @@ def run_benchmark(
         check_references(sequence)
     fix_threads(settings.threads)
     total = sum((settings.rounds + 1) * len(sequence) for sequence in sequences)
-    sizes = list(settings.sizes) if settings.rounds else []
-    total += len(sizes) * (settings.rounds + 2)
+    total += len(settings.timed_sizes) * (settings.rounds + 2)
     steps = iter(range(1, total + 1))
-
-    def step() -> None:
-        on_step(next(steps), total)
-
     with new_folder(out) as folder:
-        skipped: dict[str, str] = {}
-        made = _Made(methods, settings)
-        scenes: list[Scene] = []
-        cells: list[Cell] = []
-        for sequence in with_unique_names(sequences):
-            run = _SceneRun(sequence, made, folder, settings)
-            scene, own = run.measure(step)
-            skipped |= run.errors.skipped
-            scenes.append(scene)
-            cells += own
-        with busy_machine(*(settings.load if sizes else (0, ""))):
-            costs, fits = measure_sizes(
-                [method for method in made.methods if method.model != _IDENTITY],
-                made.denoisers,
-                sizes,
-                rounds=settings.rounds,
-                threads=settings.threads,
-                device=settings.device,
-                on_step=step,
-            )
-        notes = [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
-        if settings.busy:
-            notes.insert(0, f"measured beside {settings.busy} processes, each of which keeps a core busy")
-        if settings.beside:
-            notes.insert(0, f"measured beside: {settings.beside}")
-        results = Results(
-            command=settings.command,
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
-            machine=describe_machine(settings.device),
-            rounds=settings.rounds,
-            scenes=scenes,
-            methods=methods,
-            cells=cells,
-            costs=costs,
-            fits=fits,
-            notes=notes,
-        )
+        results = _measure(sequences, methods, folder, settings, lambda: on_step(next(steps), total))
         results.write(folder)
         write_csv(results, folder)
     return results
+
+
+def _measure(
+    sequences: list[Sequence], methods: list[Method], folder: Path, settings: Settings, step: Callable[[], None]
+) -> Results:
+    """Measure on every scene and at every size, and write the images."""
+    skipped: dict[str, str] = {}
+    made = _Made(methods, settings)
+    scenes: list[Scene] = []
+    cells: list[Cell] = []
+    for sequence in with_unique_names(sequences):
+        run = _SceneRun(sequence, made, folder, settings)
+        scene, own = run.measure(step)
+        skipped |= run.errors.skipped
+        scenes.append(scene)
+        cells += own
+    with busy_machine(*(settings.load if settings.timed_sizes else (0, ""))):
+        costs, fits = measure_sizes(
+            [method for method in made.methods if method.model != _IDENTITY],
+            made.denoisers,
+            settings.timed_sizes,
+            rounds=settings.rounds,
+            threads=settings.threads,
+            device=settings.device,
+            on_step=step,
+        )
+    notes = [f"measured beside: {settings.beside}"] if settings.beside else []
+    if settings.busy:
+        notes.append(f"measured beside {settings.busy} processes, each of which keeps a core busy")
+    notes += [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
+    return Results(
+        command=settings.command,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        machine=describe_machine(settings.device),
+        rounds=settings.rounds,
+        scenes=scenes,
+        methods=methods,
+        cells=cells,
+        costs=costs,
+        fits=fits,
+        notes=notes,
+    )
 
 
 class _Made:

@@ -198,8 +198,7 @@ def open_cached(
     identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     finished = place / _key(sequence.root, [_FORMAT, *settings, found])[:32]
-    cached = _load(finished, plan)
-    if cached is not None:
+    if (cached := _load(finished, plan)) is not None:
         return cached
     try:
         with locked(place):

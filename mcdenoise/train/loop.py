@@ -119,14 +119,7 @@ def train(
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
     torch.manual_seed(config.seed)
-    start: dict[str, Any] = describe_weights(initial_weights) if initial_weights else {"settings": {}, "sha256": "none"}
-    settings: dict[str, Any] = {**start["settings"], **config.model_settings}
-    network = _trainable(config, create_model(config.model, weights=initial_weights, **settings))
-    if config.start_from:
-        if initial_weights is not None:
-            raise InputError("start_from: expected none beside initial weights, found both; leave one out")
-        method = parse_method(config.start_from)
-        start["sha256"] = start_with(network, method.model, **method.settings)
+    network, settings, start = _begun(config, initial_weights)
     front, rest = split(network)
     if config.keep_fireflies and not front.accumulates:
         raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")
@@ -136,7 +129,7 @@ def train(
     run.check(config=settled)
     with fabric.rank_zero_first():
         data = folders.load(cache or out / "cache")
-    identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
+    identity = {"credits": credits, "initial_weights": start, **data.description}
     identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
@@ -165,11 +158,21 @@ def train(
     return weights
 
 
-def _trainable(config: TrainConfig, model: Model) -> Any:
-    """The model in training mode, typed as both model and module."""
+def _begun(config: TrainConfig, weights: Path | None) -> tuple[Any, dict[str, Any], str]:
+    """The model in training mode, its settings, and the checksum of the weights that it begins with."""
+    start: dict[str, Any] = describe_weights(weights) if weights else {"settings": {}, "sha256": "none"}
+    settings: dict[str, Any] = {**start["settings"], **config.model_settings}
+    # Typed as both model and module.
+    model: Any = create_model(config.model, weights=weights, **settings)
     if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
         raise InputError(f"model '{config.model}': expected one that learns, found one without weights")
-    return model.train()
+    network: Any = model.train()
+    if config.start_from:
+        if weights is not None:
+            raise InputError("start_from: expected none beside initial weights, found both; leave one out")
+        method = parse_method(config.start_from)
+        start["sha256"] = start_with(network, method.model, **method.settings)
+    return network, settings, start["sha256"]
 
 
 def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
