@@ -311,6 +311,7 @@ function startComparer() {
   }
 
   function openScene(index, changes = {}) {
+    const exposure = index === state.scene && state.left ? state.exposure : data.scenes[index].exposure;
     state.scene = index;
     const names = Object.keys(scene().pictures);
     for (const side of ["left", "right"]) {
@@ -321,7 +322,7 @@ function startComparer() {
     element("frame").max = scene().frames.length - 1;
     const frame = clamp(wanted.frame ?? state.frame ?? scene().start, 0, scene().frames.length - 1);
     const center = { x: scene().width / 2, y: scene().height / 2 };
-    change({ zoom: 1, center, exposure: scene().exposure, ...wanted, frame });
+    change({ zoom: 1, center, exposure, ...wanted, frame });
   }
 
   /* Zoom and pan: what is under the pointer stays under it. */
