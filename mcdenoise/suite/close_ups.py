@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mcdenoise.data.exr import Image, read_exr
-from mcdenoise.report.pictures import Codes, Crop, crop_errors, to_srgb
+from mcdenoise.data.png import Picture, caption, enlarge, write_png
+from mcdenoise.report.pictures import Crop, crop_errors, to_srgb
 from mcdenoise.results import IMAGES, Results
 from mcdenoise.suite.rows import Row
 
@@ -35,7 +36,7 @@ PARTS: dict[str, dict[str, tuple[float, float, float, float]]] = {
     "garden": {"fence": (0.45, 0.3, 0.85, 0.6), "glass": (0.3, 0.52, 0.55, 0.85), "grass": (0.05, 0.6, 0.4, 0.95)},
     "attic": {"boxes": (0.1, 0.4, 0.5, 0.8), "head": (0.5, 0.45, 0.85, 0.95)},
 }
-_GAP, _TITLE, _LEAST_WIDTH = 4, 26, 240
+_GAP, _LEAST_WIDTH = 4, 320
 
 
 def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: Sequence[str]) -> list[Path]:
@@ -69,7 +70,9 @@ def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: 
             )
             path = folder / "close-ups" / row.name / f"{name}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write(path, [_panel(title, image, reference, crop) for title, image in pictures])
+            columns = [_column(title, image, reference, crop) for title, image in pictures]
+            gap = np.full((len(columns[0]), _GAP, 3), 255, np.uint8)
+            write_png(path, np.concatenate([part for column in columns for part in (column, gap)][:-1], 1))
             written.append(path)
     return written
 
@@ -89,29 +92,11 @@ def _pictures(folder: Path, results: Results, row: Row, shown: Sequence[str]) ->
     return found
 
 
-def _panel(title: str, image: Image, reference: Image, crop: Crop) -> tuple[list[str], Codes]:
+def _column(title: str, image: Image, reference: Image, crop: Crop) -> Picture:
+    """A crop, enlarged, below its title and its errors."""
     own, truth = np.ascontiguousarray(crop.of(image)), np.ascontiguousarray(crop.of(reference))
-    factor = max(1, -(-_LEAST_WIDTH // own.shape[1]))
-    pixels = to_srgb(own).repeat(factor, 0).repeat(factor, 1)
-    # Drop the names of settings, which would not fit, and keep their values.
-    title = re.sub(r"\w+=", "", title)
-    if image is reference:
-        return [title, ""], pixels
+    picture = enlarge(to_srgb(own), max(1, -(-_LEAST_WIDTH // own.shape[1])))
     psnr, smape = crop_errors(own, truth)
-    return [title, f"{psnr:.2f} dB, SMAPE {smape:.3f}"], pixels
-
-
-def _write(path: Path, panels: list[tuple[list[str], Codes]]) -> None:
-    import PIL.Image
-    import PIL.ImageDraw
-
-    height, width, _ = panels[0][1].shape
-    sheet = PIL.Image.new("RGB", ((width + _GAP) * len(panels) - _GAP, height + _TITLE), "white")
-    draw = PIL.ImageDraw.Draw(sheet)
-    for index, (lines, pixels) in enumerate(panels):
-        left = index * (width + _GAP)
-        for line, text in enumerate(lines):
-            # Cut long titles, which would run into the neighbouring panel.
-            draw.text((left + 2, 1 + 12 * line), text[: width // 6], fill="black")
-        sheet.paste(PIL.Image.fromarray(pixels), (left, _TITLE))
-    sheet.save(path)
+    errors = "" if image is reference else f"{psnr:.2f} dB, SMAPE {smape:.3f}"
+    # Drop the names of settings, which would not fit, and keep their values.
+    return caption(caption(picture, errors), re.sub(r"\w+=", "", title))

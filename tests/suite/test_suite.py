@@ -14,6 +14,7 @@ import pytest
 
 from mcdenoise.cli import main
 from mcdenoise.data import read_exr, write_exr
+from mcdenoise.data.png import read_png
 from mcdenoise.errors import InputError
 from mcdenoise.methods import split_methods
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
@@ -326,12 +327,10 @@ def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
         write_exr(path, image, ["R", "G", "B"])
     written = write_close_ups(tmp_path, results, rows, ["noisy", "ours", "oidn(quality=fast)"])
     assert [path.stem for path in written] == list(PARTS["parlour"])
-    import PIL.Image
-
-    with PIL.Image.open(written[0]) as sheet:
-        pixels = np.asarray(sheet)
+    pixels = read_png(written[0]).astype(int)
     width = (pixels.shape[1] - 2 * 4) // 3
-    noisy, ours, reference = (pixels[26:, left : left + width] for left in range(0, pixels.shape[1], width + 4))
+    # Below two lines of text.
+    noisy, ours, reference = (pixels[56:, left : left + width] for left in range(0, pixels.shape[1], width + 4))
     np.testing.assert_array_equal(ours, reference)
     assert noisy.min() > reference.max()
 
