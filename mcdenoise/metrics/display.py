@@ -118,11 +118,16 @@ def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
         [1.0]
     """
     check_images(image, reference)
+    return ssim_of(displayed(image), displayed(reference))
+
+
+def ssim_of(image: Tensor, reference: Tensor) -> Tensor:
+    """As :func:`ssim_srgb`, of images in [0, 1] that are shown as they are, with any number of channels."""
     if min(image.shape[-2:]) < _SSIM_WINDOW:
         raise UncomputableError(
             f"SSIM's window: expected at least 11 x 11 pixels, found {image.shape[-2]} x {image.shape[-1]}"
         )
-    shown, expected = (displayed(x).reshape(-1, *x.shape[-3:]) for x in (image, reference))
+    shown, expected = (x.reshape(-1, *x.shape[-3:]) for x in (image, reference))
     # Drop kornia's epsilon, so that equal images give 1: the denominator is at least K1^2 K2^2 without it.
     similarity = ssim(shown, expected, _SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
     return similarity.mean((-3, -2, -1)).reshape(image.shape[:-3])

@@ -6,6 +6,7 @@ Numbers of different protocols are not comparable: for the same images, the SSIM
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,14 +14,16 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from mcdenoise.metrics._check import check_images
-from mcdenoise.metrics._similarity import gaussian, multiscale_similarity, similarity, uniform
-from mcdenoise.metrics.display import displayed, flip, psnr_srgb, ssim_srgb
+from mcdenoise.metrics._check import UncomputableError, check_images
+from mcdenoise.metrics.display import displayed, flip, psnr_srgb, ssim_of, ssim_srgb
 from mcdenoise.metrics.metric import Metric
 
 ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
 
+# Side of the window of the older SSIM.
+_BOX = 7
 # The published code of both protocols rounds 1 / 2.2 to this.
 _GAMMA = 0.454545
 # The ACES fit by Stephen Hill (BakingLab): matrices from linear sRGB to the space of the curve and back.
@@ -116,9 +119,17 @@ def _psnr(image: Tensor, reference: Tensor) -> Tensor:
 
 def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
     """SSIM by the defaults of scikit-image before 0.20 for floats: 7x7 box, sample covariance, a data range of 2."""
-    tests, truths = (x.reshape(-1, *x.shape[-3:]) for x in (image, reference))
-    values, _ = similarity(tests, truths, uniform(), data_range=2, sample_covariance=True)
-    return values.mean(1).reshape(image.shape[:-3])
+    x, y = (each.reshape(-1, *each.shape[-3:]) for each in (image, reference))
+    if min(x.shape[-2:]) < _BOX:
+        raise UncomputableError(
+            f"SSIM's window: expected at least {_BOX} x {_BOX} pixels, found {x.shape[-2]} x {x.shape[-1]}"
+        )
+    mean = partial(avg_pool2d, kernel_size=_BOX, stride=1)
+    sample, c1, c2 = _BOX**2 / (_BOX**2 - 1), (0.01 * 2) ** 2, (0.03 * 2) ** 2
+    xx, yy, xy = (sample * (mean(a * b) - mean(a) * mean(b)) for a, b in ((x, x), (y, y), (x, y)))
+    x, y = mean(x), mean(y)
+    values = (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
+    return values.mean((-3, -2, -1)).reshape(image.shape[:-3])
 
 
 def _smape_percent(image: Tensor, reference: Tensor) -> Tensor:
@@ -137,12 +148,21 @@ def _luminance(shown: Tensor) -> Tensor:
 
 
 def _ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
-    values, _ = similarity(_luminance(image), _luminance(reference), gaussian(), data_range=1)
-    return values.reshape(image.shape[:-3])
+    return ssim_of(_luminance(image), _luminance(reference)).reshape(image.shape[:-3])
 
 
 def _ms_ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
-    values = multiscale_similarity(_luminance(image), _luminance(reference), data_range=1)
+    if min(image.shape[-2:]) <= 160:
+        raise UncomputableError(
+            f"MS-SSIM's five scales: expected more than 160 x 160 pixels, found {image.shape[-2]} x {image.shape[-1]}"
+        )
+    try:
+        ms_ssim = importlib.import_module("pytorch_msssim").ms_ssim
+    except ImportError as error:
+        raise UncomputableError(
+            "MS-SSIM needs pytorch-msssim, which is not installed; pip install 'mcdenoise[peers]', or skip it"
+        ) from error
+    values: Tensor = ms_ssim(_luminance(image), _luminance(reference), data_range=1.0, size_average=False)
     return values.reshape(image.shape[:-3])
 
 

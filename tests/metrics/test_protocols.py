@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any, get_args
 
 import numpy as np
@@ -196,3 +197,10 @@ def test_images_must_agree(name: ProtocolName) -> None:
     for metric in PROTOCOLS[name].metrics.values():
         with pytest.raises(ValueError, match="reference:"):
             metric.function(torch.rand(1, 3, 20, 20), torch.rand(1, 3, 20, 21))
+
+
+def test_ms_ssim_without_its_package_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pytorch_msssim", None)
+    image = torch.rand(1, 3, 161, 161)
+    with pytest.raises(UncomputableError, match=r"pytorch-msssim.*mcdenoise\[peers\]"):
+        PROTOCOLS["noisebase"].metrics["MS-SSIM"].function(image, image)
