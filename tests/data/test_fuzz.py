@@ -206,12 +206,6 @@ def test_damaged_images(tmp_path: Path, intact: dict[str, bytes]) -> None:
     fuzz(tmp_path, intact, 160, seed=0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(1, 5))
-def test_damaged_images_at_length(tmp_path: Path, intact: dict[str, bytes], seed: int) -> None:
-    fuzz(tmp_path, intact, 640, seed)
-
-
 MATRICES_TEXT = (
     b"{",
     b"}",
@@ -265,8 +259,3 @@ def fuzz_matrices(tmp_path: Path, count: int, seed: int) -> None:
 
 def test_damaged_camera_matrices(tmp_path: Path) -> None:
     fuzz_matrices(tmp_path, 60, seed=0)
-
-
-@pytest.mark.slow
-def test_damaged_camera_matrices_at_length(tmp_path: Path) -> None:
-    fuzz_matrices(tmp_path, 800, seed=1)

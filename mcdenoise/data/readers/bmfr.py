@@ -61,7 +61,7 @@ Files = Mapping[str, Mapping[int, Path]]
 
 
 @dataclass(kw_only=True)
-class BmfrFolder(RenderedFiles):
+class _BmfrFolder(RenderedFiles):
     """A folder in this layout: ``{color,albedo,shading_normal,world_position,...}N.exr`` and ``camera_matrices.h``.
 
     Further noisy colors of the same frames, with other noise seeds, are ``noise_seed{1,2,...}/colorN.exr``. If other
@@ -80,12 +80,10 @@ class BmfrFolder(RenderedFiles):
 
     @property
     def folders(self) -> set[Path]:
-        """The folders of the files."""
         return {self.path}
 
     @property
     def noise_seeds(self) -> int:
-        """The number of noisy colors that every frame in use has."""
         return 1 + len(self.more)
 
     @property
@@ -102,24 +100,20 @@ class BmfrFolder(RenderedFiles):
 
     @property
     def unused(self) -> list[str]:
-        """Files that look like buffers of the layout but are not used."""
         return _others(self.path)
 
     def frame_files(self, number: int) -> list[Path]:
-        """The files of one frame without its references, and the files that describe all frames."""
         description = self.path / _DESCRIPTION
         return super().frame_files(number) + ([description] if description.is_file() else [])
 
     def frame(
         self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
     ) -> Frame:
-        """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
         if noise_seed:
             return replace(self, groups=self.more[noise_seed - 1]).frame(number, reference=reference, buffers=buffers)
         return super().frame(number, reference=reference, buffers=buffers)
 
     def as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
-        """A frame of stored images."""
         if not self.color_has_albedo:
             images["color"] = images["color"] * images["albedo"]
         normal = images.get("normal")
@@ -156,7 +150,7 @@ class BmfrFolder(RenderedFiles):
         return known
 
     def check_output_layer(self, name: str) -> None:
-        """There are no layers; see :meth:`mcdenoise.data.Sequence.check_output_layer`."""
+        # There are no layers.
         Source.check_output_layer(self, name)
 
     def target(self, source: Path) -> str:
@@ -215,7 +209,7 @@ def open_bmfr(
     files: Files,
     choose_numbers: Callable[[list[int]], list[int]],
     color_has_albedo: bool | None = None,
-) -> BmfrFolder:
+) -> Source:
     """Check the selected frames of a folder by file names and headers, and the values of the first frame.
 
     Args:
@@ -248,7 +242,7 @@ def open_bmfr(
     choice = Choice({name: layer for name, layer in buffers.items() if name not in (DIFFUSE, SPECULAR)})
     choice.written = [layers["color"]]
     more = _find_noise_seeds(path, numbers, groups, files)
-    shot = BmfrFolder(groups, parts, choice, path=path, numbers=numbers, more=more)
+    shot = _BmfrFolder(groups, parts, choice, path=path, numbers=numbers, more=more)
     everywhere = {*(layer for each in split for layer in each.layers), *(samples.layers if samples else ())}
     for own in (groups, *more):
         everywhere &= check_files(replace(shot, groups=own), split, samples, one_window=True)

@@ -291,13 +291,6 @@ def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., l
     assert meaning is None or taken[meaning] == f"{letter}_1.exr"
 
 
-def test_files_without_radiance_are_not_denoised(
-    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
-) -> None:
-    image("albedo_1.exr", "normal_1.exr")
-    assert "expected noisy radiance, found" in refused(open_sequence, tmp_path)
-
-
 def test_links_are_files(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     (path,) = image("data/a.exr")
     (tmp_path / "shot").mkdir()

@@ -111,12 +111,6 @@ def test_diffuse_light_alone_gives_no_parts_and_no_warning(tmp_path: Path, save:
     assert not sequence.warnings
 
 
-def test_a_file_without_color_is_refused(tmp_path: Path, save: Save, refused: Callable[..., str]) -> None:
-    channels, _ = blender("Combined")
-    path = save(tmp_path / "shot_0001.exr", channels)
-    assert "expected noisy radiance" in refused(open_sequence, path)
-
-
 @pytest.mark.parametrize("layout", ["layers", "files", "files of a shot"])
 @pytest.mark.parametrize("emits", [False, True])
 def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
