@@ -59,10 +59,13 @@ def _fold_edges(padded: Tensor, radius: int, size: int, dim: int) -> Tensor:
 
 def taps(image: Tensor, kernel_size: int, border: Border) -> Iterator[Tensor]:
     """The image as each tap of the window sees it, as views of one padded copy."""
-    radius = kernel_size // 2
-    padded = pad(image, radius, border)
-    for _, dy, dx in offsets(kernel_size):
-        yield shifted(padded, radius, dy, dx, *image.shape[-2:])
+    height, width = image.shape[-2:]
+    padded = pad(image, kernel_size // 2, border)
+    for top in range(kernel_size):
+        # One view of these rows for all taps in them, whose derivatives are padded together.
+        rows = padded.narrow(-2, top, height)
+        for left in range(kernel_size):
+            yield rows.narrow(-1, left, width)
 
 
 def offsets(kernel_size: int) -> Iterator[tuple[int, int, int]]:

@@ -143,16 +143,18 @@ def _exponent(
     largest = torch.finfo(dtype).max
     centres = [guide.to(dtype) for guide in guides]
     scales = [falloff.to(dtype) for falloff in falloffs]
-    logits = start.to(dtype).clamp(-largest, largest).split(1, 1)
     moved = [taps(centre, kernel_size, border) for centre in centres]
-    exponents = []
-    for exponent, (_, dy, dx) in zip(logits, offsets(kernel_size), strict=True):
+    distances = []
+    for _, dy, dx in offsets(kernel_size):
+        distance = torch.zeros_like(start[:, :1], dtype=dtype)
         seen = [next(each) for each in moved]
         # The middle of the window is no distance away.
         if (dy, dx) != (0, 0):
             for scale, tap, centre in zip(scales, seen, centres, strict=True):
-                exponent = exponent - scale * squared_distance(tap, centre)
+                distance = distance + scale * squared_distance(tap, centre)
             if distance_falloff is not None:
-                exponent = exponent - (dy * dy + dx * dx) * distance_falloff.to(dtype)
-        exponents.append(exponent)
-    return torch.cat(exponents, 1)
+                distance = distance + (dy * dy + dx * dx) * distance_falloff.to(dtype)
+        distances.append(distance)
+    # One plane after the other, whatever the layout of the kernel: every tap is read on its own.
+    logits = start.to(dtype).contiguous().clamp(-largest, largest)
+    return logits - torch.cat(distances, 1)
