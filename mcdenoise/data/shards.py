@@ -11,7 +11,8 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ SUFFIX = ".take.npz"
 ERROR = "reference_error"
 _FORMAT = 1
 _LARGEST_HEADER = 1 << 20
+# Characters of a message about damage.
+_LONGEST = 160
 
 Halves = NDArray[np.float16]
 
@@ -68,17 +71,9 @@ class Shard:
         Raises:
             InputError: the file is damaged or gone.
         """
-        try:
-            check_file(self.path)
-            with zipfile.ZipFile(self.path) as files:
-                return {
-                    name: _joined(files, name, shape)
-                    for name, shape in self.shapes.items()
-                    if names is None or name in names
-                }
-        # zipfile, zlib and numpy raise a dozen different exceptions for damaged data.
-        except Exception as error:
-            raise _damaged(self.path, error) from error
+        with _opened(self.path) as files:
+            wanted = {name: shape for name, shape in self.shapes.items() if names is None or name in names}
+            return {name: _joined(files, name, shape) for name, shape in wanted.items()}
 
 
 def write_shard(path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDArray[np.floating[Any]]]) -> None:
@@ -114,11 +109,10 @@ def open_shard(path: Path) -> Shard:
     Raises:
         InputError: it is none, or is damaged.
     """
-    try:
-        check_file(path)
-        with zipfile.ZipFile(path) as files, files.open("header.json") as file:
+    with _opened(path) as files:
+        with files.open("header.json") as file:
             header = json.loads(file.read(_LARGEST_HEADER))
-            checksums = sorted((entry.filename, entry.CRC) for entry in files.infolist())
+        checksums = sorted((entry.filename, entry.CRC) for entry in files.infolist())
         shapes = {name: _shape(name, shape) for name, shape in header["shapes"].items()}
         frames, _, *size = shapes["color"]
         for name, (count, _, *own) in shapes.items():
@@ -126,8 +120,6 @@ def open_shard(path: Path) -> Shard:
                 raise ValueError(f"{name} of another size")
         if header["format"] != _FORMAT or "reference" not in shapes:
             raise ValueError("another format")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, zipfile.BadZipFile) as error:
-        raise _damaged(path, error) from error
     return Shard(path, header, shapes, hashlib.sha256(repr(checksums).encode()).hexdigest())
 
 
@@ -167,6 +159,15 @@ def _entry(name: str) -> zipfile.ZipInfo:
     return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
 
 
-def _damaged(path: Path, error: Exception) -> InputError:
-    found = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return InputError(f"{path}: expected a packed take, found {found}; render it again")
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """The zip; whatever goes wrong with it is one line."""
+    try:
+        check_file(path)
+        with zipfile.ZipFile(path) as files:
+            yield files
+    # zipfile, zlib and numpy raise a dozen different exceptions for damaged data, some with all of the data.
+    except Exception as error:
+        found = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        found = " ".join(found.split())[:_LONGEST]
+        raise InputError(f"{path}: expected a packed take, found {found}; render it again") from error
