@@ -456,7 +456,10 @@ class Denoiser:
             # Before a network runs, so that it has the memory.
             self._before = None
             return self._state, seen
-        report.repeats = "the noise is that of the frame before, pixel by pixel; render each frame with its own seed"
+        report.repeats = (
+            "the noise is that of the frame before, pixel by pixel, and counts once, as it does only on a CPU where "
+            "nothing moves; render each frame with its own seed"
+        )
         self._doubt(report.repeats)
         return self._before, seen
 
