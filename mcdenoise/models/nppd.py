@@ -53,11 +53,11 @@ from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
-from mcdenoise.models.tiled import MIRRORED, Region
+from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
-from mcdenoise.ops._window import corner, mirrored, up_to_multiple
+from mcdenoise.ops._window import corner, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
 
@@ -232,7 +232,7 @@ class Nppd(nn.Module):
         # As in Tiled, there is a mirror image around the image, except in training.
         border = 0 if self.training else MIRRORED
         radiance, mean_before, image_before, features, features_before, both = (
-            mirrored(image, (border, border), (border, border))
+            with_border(image, border)
             for image in (radiance, mean_before, image_before, features, features_before, _logarithm(both))
         )
         fine, coarse = self._weights(torch.cat([both, features_before, features], 1))  #                            3.
@@ -241,8 +241,7 @@ class Nppd(nn.Module):
         features = torch.lerp(features, features_before, trust)
         denoised = _denoised(radiance, fine, coarse)  #                                                             5.
         image = torch.lerp(denoised, _splatted(image_before, fine["previous"]), mix)  #                             6.
-        inside = Region(border, border, border + frame.size[0], border + frame.size[1])
-        radiance, image, features = (inside.of(each).contiguous() for each in (radiance, image, features))
+        radiance, image, features = (without_border(each, border) for each in (radiance, image, features))
         stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
         result = image[:, :3].to(frame.color.dtype)
         output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)

@@ -47,10 +47,9 @@ from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.recurrent import Before, from_before, to_be_kept
-from mcdenoise.models.tiled import MIRRORED
+from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.ops import upsample
-from mcdenoise.ops._window import mirrored
 
 STAGES, GROWTH, SLOPE = 5, 4 / 3, 0.1
 _TYPICAL = 0.5  # exposed radiance
@@ -122,7 +121,7 @@ class Rae(nn.Module):
         memory = own_state(state, Memory, frame, channels=self.encoder[0].entry.out_channels)
         # As in Tiled, there is a mirror image around the image, except in training.
         border = 0 if self.training else MIRRORED
-        x, (hidden, notes) = mirrored(input_of(frame), (border, border), (border, border)), _recalled(frame, memory)
+        x, (hidden, notes) = with_border(input_of(frame), border), _recalled(frame, memory)
         found: list[Tensor] = []
         for stage, before in zip(self.encoder, hidden, strict=False):
             x = stage(x, before)
@@ -136,7 +135,7 @@ class Rae(nn.Module):
             x = second(_leaky(first(x)))
             x = _leaky(x) if found else x
         maximum = torch.log1p(color.amax((1, 2, 3), keepdim=True))
-        x = x.narrow(-2, border, color.shape[-2]).narrow(-1, border, color.shape[-1])
+        x = without_border(x, border)
         image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), maximum))
         kept = to_be_kept(frame, torch.zeros_like(color[:, :1]))
         return Output(image, notes=notes), None if kept is None else Memory(after, kept)

@@ -121,6 +121,17 @@ class Tiled(Wrapper):
         return None if parts == whole else parts
 
 
+def with_border(image: Tensor, width: int = MIRRORED) -> Tensor:
+    """``(..., H, W)`` with its mirror image around it, for a method that sees the whole image."""
+    return mirrored(image, (width, width), (width, width))
+
+
+def without_border(image: Tensor, width: int = MIRRORED) -> Tensor:
+    """The opposite of :func:`with_border`."""
+    height, columns = (side - 2 * width for side in image.shape[-2:])
+    return image.narrow(-2, width, height).narrow(-1, width, columns).contiguous()
+
+
 def _known(frame: Frame, stage: str) -> Tensor:
     """The values of pixels that are not computed: the known result, or the input."""
     if stage.startswith(_LAYER):

@@ -28,10 +28,9 @@ from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.clamped import without_fireflies
 from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
-from mcdenoise.models.tiled import MIRRORED, Region
+from mcdenoise.models.tiled import with_border, without_border
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import cross_bilateral_filter
-from mcdenoise.ops._window import mirrored
 from mcdenoise.sampling import has_centred_features, has_scattered_features
 
 Engine = Literal["auto", "library", "torch"]
@@ -125,9 +124,8 @@ class WithOidn(Wrapper):
         centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo, frame.normal)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
         given = without_fireflies(given.map(_phases) if spread else given)
-        height, width = given.size
         # The networks take what is beyond an image as black.
-        given = given.map(lambda image: mirrored(image, (MIRRORED, MIRRORED), (MIRRORED, MIRRORED)))
+        given = given.map(with_border)
         exact = centred and not has_scattered_features(frame)
         images = {OIDN: (noisy := oidn.denoised(given, "noisy"))}
         clean = given if exact or not self.clean else oidn.with_clean_features(given, self.prefilter)
@@ -136,8 +134,7 @@ class WithOidn(Wrapper):
             images[OIDN_CLEAN] = noisy if given.albedo is None else oidn.denoised(clean, "clean")
         if clean.albedo is not None and (exact or self.clean):
             images[OIDN_ALBEDO] = clean.albedo
-        inside = Region(MIRRORED, MIRRORED, MIRRORED + height, MIRRORED + width)
-        images = {name: inside.of(image).contiguous() for name, image in images.items()}
+        images = {name: without_border(image) for name, image in images.items()}
         if spread:
             images = {name: _without_pattern(_merged(image, frame.size)) for name, image in images.items()}
         images |= {NOISY: frame.color, CENTRED: torch.full_like(frame.color[:, :1], float(centred))}
