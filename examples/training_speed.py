@@ -1,14 +1,12 @@
-"""Measure training steps with the fast backends of the operators and with the reference implementations.
+"""Measure training steps in each precision.
 
     python examples/training_speed.py
     python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
 
 A step is that of `mcdenoise train`: it draws clips, runs the network forward and backward, and updates the weights and
-their moving average. Without a sequence the clips are random. Every round makes one step in each precision with the
-fast backends ("fast") and with the reference ("plain") on the same clips, one after the other, so that other work of
-the machine affects all of them equally; two rounds warm up and do not count. The script prints medians, quartiles,
-steps per second, and the speedup of the fast backends. As in the command, the process keeps freed memory
-(mcdenoise/heap.py).
+their moving average. Without a sequence the clips are random. Every round makes one step in each precision, one after
+the other, so that other work of the machine affects both equally; two rounds warm up and do not count. The script
+prints medians, quartiles and steps per second. As in the command, the process keeps freed memory (mcdenoise/heap.py).
 """
 
 import argparse
@@ -18,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import get_args
 
@@ -26,7 +23,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mcdenoise import ops
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
@@ -65,7 +61,7 @@ def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
         return DataFolders.open(config, front, rest.needs, sequences, []).load(Path(cache)).sampler
 
 
-def steps(config: TrainConfig, sampler: ClipSampler, reference: bool) -> Callable[[int], None]:
+def steps(config: TrainConfig, sampler: ClipSampler) -> Callable[[int], None]:
     """A function that makes the training step of a number; all start from the same weights."""
     torch.manual_seed(config.seed)
     fabric = open_fabric("cpu", config.precision, config.batch)
@@ -73,8 +69,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, reference: bool) -> Callabl
     trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
 
     def step(number: int) -> None:
-        with ops.use("torch", strict=False) if reference else nullcontext():
-            trainer.step(number, sampler.draw(trainer.seeds(number)))
+        trainer.step(number, sampler.draw(trainer.seeds(number)))
 
     return step
 
@@ -96,7 +91,7 @@ def main() -> None:
             raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     fix_threads(options.threads)
     keep_heap()
-    runs: dict[tuple[Precision, str], Callable[[int], None]] = {}
+    runs: dict[Precision, Callable[[int], None]] = {}
     for precision in get_args(Precision):
         config = TrainConfig(
             model=options.model,
@@ -110,11 +105,9 @@ def main() -> None:
             validation_frames=0,
         )
         check_config(config, 1)
-        sampler = clips(config, options.sequences)
-        for backend in ("fast", "plain"):
-            runs[precision, backend] = steps(config, sampler, backend == "plain")
+        runs[precision] = steps(config, clips(config, options.sequences))
 
-    times: dict[tuple[Precision, str], list[float]] = {run: [] for run in runs}
+    times: dict[Precision, list[float]] = {run: [] for run in runs}
     for number in range(WARM_UP + options.rounds):
         for run, step in runs.items():
             start = time.perf_counter()
@@ -126,15 +119,13 @@ def main() -> None:
     size = f"{options.batch} clips of {options.frames} frames of {options.crop}x{options.crop}"
     print(f"{options.model}, {size}, {options.rounds} rounds")
     print(f"{machine.processor}, {options.threads} threads, {', '.join(map(' '.join, machine.packages.items()))}")
-    print(f"{'precision':<12}{'ops':<8}{'ms a step':>10}{'quartiles':>16}{'steps/s':>10}{'plain / this':>14}")
-    for (precision, backend), values in times.items():
+    print(f"{'precision':<12}{'ms a step':>10}{'quartiles':>16}{'steps/s':>10}")
+    for precision, values in times.items():
         low, median, high = statistics.quantiles(values, n=4)
-        ratio = statistics.median(times[precision, "plain"]) / median
         spread = f"{low:.0f} .. {high:.0f}"
-        print(f"{precision:<12}{backend:<8}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}{ratio:>14.2f}")
+        print(f"{precision:<12}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}")
     if options.json:
-        written = {f"{precision}, {backend}": values for (precision, backend), values in times.items()}
-        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": written}, indent=2) + "\n")
+        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": times}, indent=2) + "\n")
 
 
 if __name__ == "__main__":
