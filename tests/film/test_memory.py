@@ -1,4 +1,4 @@
-"""Thousands of frames through one process: memory stays what it is."""
+"""Ten thousand frames through one process: memory stays what it is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcdenoise.film.record import FrameRecord, Journal, read_records
 from mcdenoise.film.work import Order, make, scan
 from mcdenoise.shot import ShotSettings
 
-FRAMES, DIFFERENT = 4_000, 50
+FRAMES, DIFFERENT = 10_000, 50
 
 
 def resident() -> int:
