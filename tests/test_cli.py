@@ -338,42 +338,9 @@ def test_a_bad_result_is_not_written(
     assert not list(out.iterdir())
 
 
-def missing_buffer(inputs: Path) -> None:
-    (inputs / "albedo2.exr").unlink()
-
-
 def missing_frame(inputs: Path) -> None:
     for path in inputs.glob("*1.exr"):
         path.unlink()
-
-
-def another_size(inputs: Path) -> None:
-    write_exr(inputs / "shading_normal3.exr", np.zeros((20, 22, 3)), RGB)
-
-
-def no_cameras(inputs: Path) -> None:
-    (inputs / "camera_matrices.h").write_text("const float pi = 3;")
-
-
-@pytest.mark.parametrize(
-    ("spoil", "expected"),
-    [
-        (missing_buffer, "albedo2.exr: expected buffer 'albedo' for every frame"),
-        (another_size, "shading_normal3.exr: expected 24 x 20 pixels like the first color file, found 22 x 20"),
-        (no_cameras, "camera_matrices.h: expected 'camera_matrices'"),
-    ],
-)
-def test_an_inconsistent_sequence_leaves_no_files(
-    refused: Callable[..., str],
-    denoise: list[Any],
-    small_sequence: Path,
-    out: Path,
-    spoil: Callable[[Path], None],
-    expected: str,
-) -> None:
-    spoil(small_sequence / "inputs")
-    assert expected in refused(*denoise)
-    assert not out.exists()
 
 
 def test_a_missing_frame_is_reported_and_skipped(
@@ -417,20 +384,11 @@ def test_a_truncated_image_leaves_only_whole_files(
     assert whole_images(out) == ["denoised0.exr", "denoised1.exr"]
 
 
-@pytest.mark.parametrize(("stem", "buffer"), [("albedo", "albedo"), ("shading_normal", "normal")])
-@pytest.mark.parametrize("value", [np.inf])
 def test_an_invalid_feature_leaves_only_whole_files(
-    refused: Callable[..., str],
-    denoise: list[Any],
-    small_sequence: Path,
-    out: Path,
-    stem: str,
-    buffer: str,
-    value: float,
+    refused: Callable[..., str], denoise: list[Any], small_sequence: Path, out: Path
 ) -> None:
-    edit(small_sequence / "inputs" / f"{stem}1.exr", lambda pixels: pixels.__setitem__((3, 4), value))
-    message = refused(*denoise)
-    assert f"frame 1: buffer '{buffer}': expected finite values" in message
+    edit(small_sequence / "inputs" / "shading_normal1.exr", lambda pixels: pixels.__setitem__((3, 4), np.inf))
+    assert "frame 1: buffer 'normal': expected finite values" in refused(*denoise)
     assert whole_images(out) == ["denoised0.exr"]
 
 
@@ -445,9 +403,8 @@ def test_an_output_path_that_is_taken(refused: Callable[..., str], denoise: list
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
-@pytest.mark.parametrize("arguments", [["--version"]])
-def test_a_full_standard_output_is_reported_in_one_line(arguments: list[str]) -> None:
-    command = [sys.executable, "-m", "mcdenoise", *arguments]
+def test_a_full_standard_output_is_reported_in_one_line() -> None:
+    command = [sys.executable, "-m", "mcdenoise", "--version"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2
@@ -554,25 +511,11 @@ def test_evaluate(run: Callable[..., tuple[int, str, str]], small_sequence: Path
     assert "no flicker: " in text
 
 
-def test_evaluate_rejects_images_that_cannot_be_compared(
-    run: Callable[..., tuple[int, str, str]], refused: Callable[..., str], small_sequence: Path, colors: Path
-) -> None:
+def test_evaluate_takes_images_or_a_model(refused: Callable[..., str], small_sequence: Path, colors: Path) -> None:
     evaluate = ["evaluate", small_sequence, colors]
     assert "--protocol" in refused(*evaluate, "--protocol", "loose")
-    edit(colors / "frame.0001.exr", lambda pixels: pixels.fill(np.nan))
-    assert "found 480 NaN or infinite ones" in refused(*evaluate)
-    write_exr(colors / "frame.0001.exr", np.zeros((10, 24, 3)), RGB)
-    assert "expected 24 x 20 pixels like the sequence, found 24 x 10" in refused(*evaluate)
-    (colors / "frame.0001.exr").unlink()
-    assert "found none of frame 1" in refused(*evaluate)
-    (colors / "other.exr").touch()
-    assert "differ in one number, that of the frame" in refused(*evaluate)
-    for path in (small_sequence / "inputs").glob("reference*.exr"):
-        path.unlink()
-    assert "expected references" in refused(*evaluate)
-    assert f"found both, {colors} and cascaded_v2; omit one" in refused(*evaluate, "--model", "cascaded_v2")
-    assert f"found only the sequence {small_sequence}; name the folder after it, or" in refused(*evaluate[:2])
-    assert "no such folder" in refused("evaluate", small_sequence / "nowhere", colors)
+    assert f"found both, {colors} and cascaded_v2" in refused(*evaluate, "--model", "cascaded_v2")
+    assert f"found only the sequence {small_sequence}" in refused(*evaluate[:2])
 
 
 def test_random_weights_are_said(
@@ -632,13 +575,6 @@ def camera_path(tmp_path: Path) -> Path:
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"fov": 40, "frames": [{"position": [0, 0, 4], "look_at": [0, 0, 0]}]}))
     return path
-
-
-@pytest.mark.parametrize("size", ["64x", "64x-3", "axb"])
-def test_render_with_a_bad_size(refused: Callable[..., str], camera_path: Path, out: Path, size: str) -> None:
-    message = refused("render", "scene.xml", "--camera-path", camera_path, "-o", out, "--size", size)
-    assert f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{size}'" in message
-    assert not out.exists()
 
 
 def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
@@ -760,16 +696,12 @@ def test_a_json_may_be_in_the_folder_that_the_command_creates(small_sequence: Pa
     assert json.loads((out / "times.json").read_text())["model"] == "noisy"
 
 
-@pytest.mark.parametrize(
-    ("frames", "loaded"), [(1, "[]"), (2, "['numba']")], ids=["a still starts without it", "a sequence pays for it"]
-)
-def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path, frames: int, loaded: str) -> None:
+def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path) -> None:
     if importlib.util.find_spec("numba") is None:
         pytest.skip("needs numba: pip install 'mcdenoise[fast]'")
     # Smaller images never use compiled kernels.
     width, height = 128, 80
-    for number in range(frames):
-        write_bmfr_frame(tmp_path / "frames", number, synthetic_frame(width, height))
+    write_bmfr_frame(tmp_path / "frames", 0, synthetic_frame(width, height))
     code = (
         "import sys\n"
         "from mcdenoise.cli import main\n"
@@ -781,4 +713,4 @@ def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path, 
     command = ["denoise", str(tmp_path / "frames"), "-o", str(tmp_path / "out")]
     arguments = [*command, "--model", "cascaded_v2_micro", "--precision", "float32"]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
-    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, [loaded]), done.stderr
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["[]"]), done.stderr
