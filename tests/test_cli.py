@@ -380,7 +380,9 @@ def test_a_truncated_image_leaves_only_whole_files(
 ) -> None:
     path = small_sequence / "inputs" / "world_position2.exr"
     path.write_bytes(path.read_bytes()[:-200])
-    assert f"{path}: expected an EXR image, found damaged or missing pixels" in refused(*denoise)
+    message = refused(*denoise)
+    assert str(path) in message
+    assert "damaged or missing pixels" in message
     assert whole_images(out) == ["denoised0.exr", "denoised1.exr"]
 
 
