@@ -59,5 +59,5 @@ def test_a_lost_node_loses_nothing(cluster: Any, tmp_path: Path) -> None:
 
 
 def test_no_cluster_is_told_in_one_line() -> None:
-    with pytest.raises(InputError, match="auto.*cluster"):
+    with pytest.raises(InputError, match=r"auto.*cluster"):
         RayEngine("auto")
