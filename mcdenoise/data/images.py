@@ -34,15 +34,8 @@ _LARGEST_RATIO, _LARGEST_DWA_RATIO = 2_000, 70_000
 STORAGE_PREFIXES = ("oiio:", "openexr:", "compression", "textureformat")
 # Supported formats by OpenImageIO's names.
 FORMATS = {
-    ".exr": "openexr",
-    ".sxr": "openexr",
-    ".mxr": "openexr",
-    ".cxr": "openexr",
-    ".hdr": "hdr",
-    ".pfm": "pnm",
-    ".tif": "tiff",
-    ".tiff": "tiff",
-    ".png": "png",
+    **dict.fromkeys((".exr", ".sxr", ".mxr", ".cxr"), "openexr"),
+    **{".hdr": "hdr", ".pfm": "pnm", ".tif": "tiff", ".tiff": "tiff", ".png": "png"},
 }
 _LARGEST_PARTS, _LARGEST_CHANNELS = 1024, 4096
 # Rows to decode at a time, with all channels, although few are requested: one chunk or several. More rows would double
