@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -289,33 +288,6 @@ def test_any_exposure(scale: float) -> None:
         expected, passed([frame._replace(color=frame.color * scale) for frame in frames], "numba"), strict=True
     ):
         torch.testing.assert_close(dark.color / scale, past.color, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize("size", [(3, 3), (2, 9), (1, 1), (9, 40), (31, 5)])
-def test_lights(size: tuple[int, int]) -> None:
-    """Against the rule written out, pixel by pixel."""
-    height, width = size
-    generator = torch.Generator().manual_seed(height)
-    root = torch.rand(2, 1, *size, generator=generator, dtype=torch.float64)
-    root[0, :, : height // 2, : width // 2] = 1.5 + 0.04 * root[0, :, : height // 2, : width // 2]
-    root[1, :, height // 3 :, width // 3 :] = 2.0
-    root[1, :, -3:, :2] = 0.0
-    expected = torch.zeros_like(root)
-    for b, y, x in itertools.product(range(2), range(height), range(width)):
-        image = root[b, 0]
-        window = image[max(y - 4, 0) : y + 5, max(x - 4, 0) : x + 5]
-        blocks = (
-            image[top : top + 3, left : left + 3]
-            for top in range(y - 2, y + 1)
-            for left in range(x - 2, x + 1)
-            if 0 <= top <= height - 3 and 0 <= left <= width - 3
-        )
-        alike = any(block.max() - block.min() <= 0.03 * block.max() for block in blocks)
-        expected[b, 0, y, x] = alike and image[y, x] > 1.2 * window.mean()
-    assert expected.any() == (min(size) > 4)
-    for strided in (root, transposed(root), every_other_column(root)):
-        for backend in ("numba", "torch"):
-            assert torch.equal(by(backend, steps.lights)(strided), expected)
 
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -196,29 +195,6 @@ def test_a_coarse_scale_that_agrees_changes_nothing(backend: str) -> None:
     coarse = torch.log1p(downsample(fine))
     fused = by(backend, network.gated_fusion)(fine, coarse, weight, bias, logarithms=True)
     torch.testing.assert_close(fused, torch.log1p(fine), rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("backend", ["torch", "numba"])
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (4, 6), (5, 7)])
-def test_fusion_of_logarithms_pixel_by_pixel(height: int, width: int, backend: str) -> None:
-    """``l_f + alpha (i_c - log(1 + mean of the block))`` written out."""
-    fine = draw(1, 1, 3, height, width, torch.float64).exp()
-    coarse = draw(2, 1, 3, (height + 1) // 2, (width + 1) // 2, torch.float64)
-    weight, bias = draw(3, 1, 6, 3, 3, torch.float64), torch.tensor([-0.3], dtype=torch.float64)
-    fused = by(backend, network.gated_fusion)(fine, coarse, weight, bias, logarithms=True)
-    for y, x in itertools.product(range(height), range(width)):
-        total = float(bias)
-        for c, dy, dx in itertools.product(range(3), (-1, 0, 1), (-1, 0, 1)):
-            if 0 <= y + dy < height and 0 <= x + dx < width:
-                total += float(weight[0, c, dy + 1, dx + 1]) * math.log1p(float(fine[0, c, y + dy, x + dx]))
-                neighbour = coarse[0, c, (y + dy) // 2, (x + dx) // 2]
-                total += float(weight[0, 3 + c, dy + 1, dx + 1]) * float(neighbour)
-        alpha = 1 / (1 + math.exp(-total))
-        for c in range(3):
-            block = fine[0, c, y // 2 * 2 : y // 2 * 2 + 2, x // 2 * 2 : x // 2 * 2 + 2].mean()
-            change = float(coarse[0, c, y // 2, x // 2]) - math.log1p(float(block))
-            expected = math.log1p(float(fine[0, c, y, x])) + alpha * change
-            assert float(fused[0, c, y, x]) == pytest.approx(expected, abs=1e-12)
 
 
 def test_logarithms_have_no_residual() -> None:

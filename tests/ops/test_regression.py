@@ -56,23 +56,6 @@ def test_a_constant_stays(dtype: torch.dtype) -> None:
         torch.testing.assert_close(found, image, rtol=1e-15 if dtype == torch.float64 else 0, atol=0)
 
 
-def test_the_mean_of_every_block_stays() -> None:
-    image, features = 100 * drawn(2, 3, 64, 96), drawn(2, 4, 64, 96, seed=1)
-    found = block_regression(image, features, squares=2)
-    torch.testing.assert_close(F.avg_pool2d(found, 32), F.avg_pool2d(image, 32))
-
-
-def test_it_is_the_least_squares_of_a_block() -> None:
-    """The ridge is a hundred-millionth."""
-    image, features = drawn(1, 2, 32, 64), drawn(1, 3, 32, 64, seed=1)
-    found = block_regression(image, features)
-    for start in (0, 32):
-        y, x = (part[0, :, :, start : start + 32].flatten(1).T for part in (image, features))
-        x = torch.cat([torch.ones_like(x[:, :1]), x], 1)
-        expected = x @ torch.linalg.lstsq(x, y).solution
-        torch.testing.assert_close(found[0, :, :, start : start + 32].flatten(1).T, expected, rtol=0, atol=1e-7)
-
-
 def test_features_that_say_nothing_new_change_nothing() -> None:
     """Multiples, sums, constants and zeros, which leave the normal equations singular; and another unit."""
     image, features = drawn(1, 3, 40, 50), drawn(1, 2, 40, 50, seed=1)

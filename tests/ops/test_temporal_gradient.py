@@ -87,12 +87,3 @@ def test_strata_without_a_sample_take_those_of_their_surface() -> None:
     now = kept * light()
     found = temporal_gradient(now, light(), sampled, None, None, depth)
     torch.testing.assert_close(found, 1 - kept, rtol=1e-10, atol=0)
-
-
-def test_background_is_like_background_only() -> None:
-    depth = torch.full((1, 1, HEIGHT, WIDTH), 2.0, dtype=torch.float64)
-    depth[..., :12, :] = torch.inf
-    now = light()
-    now[..., 12:, :] = 0
-    found = temporal_gradient(now, light(), None, None, None, depth)
-    torch.testing.assert_close(found, torch.isfinite(depth).double())
