@@ -311,7 +311,7 @@ def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path, monkeypatc
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     if importlib.util.find_spec("bpy") is not None:
         pytest.skip("this Python has bpy")
-    with pytest.raises(InputError, match=r"module bpy, found none .*--blender-python$"):
+    with pytest.raises(InputError, match=r"bpy.*--blender-python$"):
         generate(tmp_path, renderer="cycles", seeds="0", frames=1)
     with pytest.raises(InputError, match="nothing that runs"):
         Blender(tmp_path / "python")
@@ -466,7 +466,7 @@ def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Pa
     assert after.keys() == before.keys()
     for name, values in before.items():
         np.testing.assert_array_equal(after[name], values)
-    with pytest.raises(InputError, match="rendered with another 'seed'"):
+    with pytest.raises(InputError, match="'seed'"):
         render_cycles(made, tmp_path, blender, **{**options, "seed": 6})
 
 

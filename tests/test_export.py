@@ -282,9 +282,9 @@ def test_models_without_a_graph_are_refused_in_one_line_and_nothing_is_written(
 
 
 def test_bad_requests_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"expected a file that ends with one of \.onnx, \.pt2"):
+    with pytest.raises(InputError, match=r"\.onnx, \.pt2"):
         export_model(Recurrent(), tmp_path / "model.bin")
-    with pytest.raises(InputError, match="buffer 'color': the model needs it"):
+    with pytest.raises(InputError, match="buffer 'color':"):
         export_model(Recurrent(), tmp_path / "model.pt2", buffers={"albedo"})
 
 

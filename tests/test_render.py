@@ -150,7 +150,7 @@ def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
     render(2)
     assert images(folder) == whole
     assert describe(folder) == description
-    with pytest.raises(InputError, match=r"rendered with seed 0, now 1"):
+    with pytest.raises(InputError, match=r"seed 0, .*1"):
         render(None, seed=1)
 
 
@@ -189,7 +189,7 @@ def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
     settings = {**SCALAR, "reference_frames": []}
     render_sequence(scene, demo_cameras(1), tmp_path, **settings)
     scene["window"] = {**scene["window"], "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
-    with pytest.raises(InputError, match="rendered with scene_sha256"):
+    with pytest.raises(InputError, match="scene_sha256"):
         render_sequence(scene, demo_cameras(1), tmp_path, **settings)
 
 
@@ -199,7 +199,7 @@ def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missin
     shutil.copytree(sequence, folder)
     about = {key: value for key, value in describe(folder).items() if key != missing}
     (folder / "camera.json").write_text(json.dumps(about) if missing else "{")
-    with pytest.raises(InputError, match=r"camera\.json: cannot be read, so the run cannot be resumed"):
+    with pytest.raises(InputError, match=r"camera\.json:"):
         render_sequence(demo_scene(), [cameras[0]], tmp_path, **{**SCALAR, "reference_frames": []})
 
 
@@ -718,9 +718,9 @@ def test_the_path_of_an_object_cannot_change(moving: Path, tmp_path: Path) -> No
     moves["ball"][1, 0, 3] += 1
     cameras = [Camera.look_at((0.1 * n, 2, 6), (0.05 * n, 0.8, 0), fov_x=50) for n in range(FLIGHT)]
     settings = {"size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
-    with pytest.raises(InputError, match="object 'ball' was elsewhere when frame 1 was rendered"):
+    with pytest.raises(InputError, match=r"object 'ball' .*frame 1"):
         render_sequence(_moving_scene(), cameras, tmp_path, moves=moves, **settings)
-    with pytest.raises(InputError, match="rendered with ball, box, lamp moving, now nothing"):
+    with pytest.raises(InputError, match="ball, box, lamp"):
         render_sequence(_moving_scene(), cameras, tmp_path, **settings)
 
 
@@ -741,7 +741,7 @@ def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:
 
 
 def test_tasks_that_cannot_be_sent_to_workers_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected plain Python and numpy for more than one worker"):
+    with pytest.raises(InputError, match="more than one worker"):
         render_sequence({**demo_scene(), "x": lambda: 0}, demo_cameras(1), tmp_path, workers=2, **TINY)
 
 
@@ -816,5 +816,5 @@ def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
     again = {"spp": 3, "noise_seeds": 2, "reference_frames": [], **SCALAR}
     render_sequence(demo_scene(), cameras, tmp_path, keep_samples=True, **again)
     assert images(folder) == before
-    with pytest.raises(InputError, match="rendered with samples_kept True, now None"):
+    with pytest.raises(InputError, match=r"samples_kept True, .*None"):
         render_sequence(demo_scene(), cameras, tmp_path, **again)

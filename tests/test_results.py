@@ -92,7 +92,7 @@ def test_missing_damaged_and_foreign_files_are_refused(results: Results, tmp_pat
         with pytest.raises(InputError, match=r"results\.json:"):
             Results.read(tmp_path)
     path.write_text(text.replace('"version": 2', '"version": 3'))
-    with pytest.raises(InputError, match=r"another version of the format: .*3 - at `\$.version`"):
+    with pytest.raises(InputError, match=r"version.*3"):
         Results.read(tmp_path)
 
 

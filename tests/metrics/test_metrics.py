@@ -108,7 +108,7 @@ def test_ssim_is_that_of_scikit_image() -> None:
 
 
 def test_ssim_needs_a_window() -> None:
-    with pytest.raises(UncomputableError, match="at least 11 x 11 pixels, found 10 x 20"):
+    with pytest.raises(UncomputableError, match=r"11 x 11 .*10 x 20"):
         ssim_srgb(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
 
 
@@ -155,7 +155,7 @@ def test_hdr_flip_of_darkness() -> None:
     images = torch.rand(2, 3, 16, 16)
     black = images.clone()
     black[1] = 0
-    with pytest.raises(UncomputableError, match="found a black one"):
+    with pytest.raises(UncomputableError, match="black"):
         flip_hdr(images, black)
     # One bright pixel suffices, and a flat reference has one exposure.
     black[1, 2, 3, 4] = 2e-5

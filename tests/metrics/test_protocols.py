@@ -188,7 +188,7 @@ def test_small_images_have_no_ssim(name: ProtocolName, size: tuple[int, int]) ->
 
 def test_small_images_have_no_five_scales() -> None:
     image = torch.rand(1, 3, 160, 200)
-    with pytest.raises(UncomputableError, match="more than 160 x 160 pixels, found 160 x 200"):
+    with pytest.raises(UncomputableError, match=r"160 x 160 .*160 x 200"):
         PROTOCOLS["noisebase"].metrics["MS-SSIM"].function(image, image)
 
 

@@ -90,7 +90,7 @@ def test_without_any_history_there_is_no_warped_error() -> None:
     clip = torch.rand(1, 2, 3, 4, 5)
     away = torch.full((1, 2, 4, 5), torch.inf)
     for call in (lambda: warping_error_srgb(clip, away), lambda: warped_rmse_srgb(clip, clip, away)):
-        with pytest.raises(UncomputableError, match="expected pixels with a history, found none"):
+        with pytest.raises(UncomputableError, match="history"):
             call()
 
 
@@ -144,5 +144,5 @@ def test_flicker_of_a_bright_still_image_is_not_rounding() -> None:
 
 
 def test_flicker_needs_two_frames() -> None:
-    with pytest.raises(ValueError, match="at least 2 frames"):
+    with pytest.raises(ValueError, match="2 frames"):
         flicker_srgb(torch.rand(1, 3, 4, 5), torch.rand(1, 3, 4, 5))

@@ -168,7 +168,7 @@ def test_needs_and_settings_out_of_range() -> None:
     assert model.needs.buffers == {"color", "normal", "position"}
     assert not model.needs.trainable
     for absent in ("normal", "position"):
-        with pytest.raises(InputError, match=f"buffer '{absent}': the model needs it, found only"):
+        with pytest.raises(InputError, match=f"buffer '{absent}':"):
             Denoiser("bmfr")(frame().replace(**{absent: None}))
     wrong = {"alpha_min": 0.0, "second_alpha": 2.0, "block": 1, "ridge": 0.0}
     for name, value in wrong.items():

@@ -93,5 +93,5 @@ def test_has_no_weights_and_refuses_invalid_settings() -> None:
         create_model("joint_bilateral", sigma_color=0)
     with pytest.raises(InputError, match="sigma_space:"):
         create_model("joint_bilateral", sigma_space=torch.inf)
-    with pytest.raises(InputError, match="it takes sigma_color, sigma_space, alpha_min"):
+    with pytest.raises(InputError, match="sigma_color, sigma_space, alpha_min"):
         create_model("joint_bilateral", sigma=1)

@@ -373,7 +373,7 @@ def test_the_register() -> None:
     message = refused(lambda: create_model("nothing"))
     assert message.startswith("model 'nothing': expected one of ")
     assert all(name in message for name in MODELS)
-    with pytest.raises(ValueError, match="'cascaded' is registered twice"):
+    with pytest.raises(ValueError, match="'cascaded'"):
         register_model("cascaded")(nn.Identity)
 
 

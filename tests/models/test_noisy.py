@@ -70,5 +70,5 @@ def test_accumulation_survives_a_cut_and_a_resize() -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(InputError, match=r"alpha_min: .*0"):
         create_model("accumulated", alpha_min=0)
-    with pytest.raises(InputError, match=r"model 'noisy': .* takes no settings"):
+    with pytest.raises(InputError, match="model 'noisy':"):
         create_model("noisy", alpha_min=0.1)

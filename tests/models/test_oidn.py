@@ -130,7 +130,7 @@ def test_history_survives_a_resize(pyoidn: Any) -> None:
 def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
     given = frame()
     given.color.requires_grad_()
-    with pytest.raises(InputError, match="the library has no derivatives"):
+    with pytest.raises(InputError, match="derivatives"):
         Oidn(threads=1)(given)
     with torch.no_grad():
         assert not Oidn(threads=1)(given)[0].image.requires_grad
@@ -146,6 +146,6 @@ def test_refuses_invalid_settings() -> None:
 
 def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match=r"needs pyoidn, .*pip install 'mcdenoise\[oidn\]'") as caught:
+    with pytest.raises(InputError, match=r"pyoidn.*mcdenoise\[oidn\]") as caught:
         create_model("oidn")
     assert "\n" not in str(caught.value)

@@ -95,22 +95,22 @@ def test_an_invalid_factory_is_refused_in_one_line(mine: Path, name: str, messag
 
 
 def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a Python file with a factory of a model, found no such file"):
+    with pytest.raises(InputError, match="no such file"):
         create_model(f"{tmp_path}/absent.py:network")
     several = tmp_path / "several.py"
     several.write_text("raise SystemExit\n\ndef smooth(): ...\n\nclass Sharp: ...\n\ndef _hidden(): ...")
-    with pytest.raises(InputError, match=r"several\.py:factory, found only the file; add :smooth or :Sharp$"):
+    with pytest.raises(InputError, match=r"several\.py.* :smooth or :Sharp$"):
         create_model(str(several))
     several.write_text("def smooth(:")
-    with pytest.raises(InputError, match=r"several\.py:factory, found only the file; add :factory$"):
+    with pytest.raises(InputError, match=r"several\.py.* :factory$"):
         create_model(str(several))
-    with pytest.raises(InputError, match="expected a Python file with a factory of a model, found no such file"):
+    with pytest.raises(InputError, match="no such file"):
         create_model(f"{tmp_path}/absent.py")
     broken = tmp_path / "broken.py"
     broken.write_text("import nothing_of_this_name")
-    with pytest.raises(InputError, match=r"broken\.py cannot be imported: ModuleNotFoundError"):
+    with pytest.raises(InputError, match=r"broken\.py.*ModuleNotFoundError"):
         create_model(f"{broken}:network")
-    with pytest.raises(InputError, match=r"package\.of\.nobody cannot be imported"):
+    with pytest.raises(InputError, match=r"package\.of\.nobody"):
         create_model("package.of.nobody:network")
 
 
@@ -136,7 +136,7 @@ def test_settings_are_those_of_the_factory(mine: Path) -> None:
 
 
 def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
-    with pytest.raises(InputError, match=r"buffer 'albedo': the model needs it, found only color; render it"):
+    with pytest.raises(InputError, match=r"buffer 'albedo': .*color"):
         Denoiser(own(mine, "network"))(frame())
 
 
@@ -211,7 +211,7 @@ def test_a_state_of_another_size_is_refused_in_one_line_where_the_model_minds() 
     denoiser(frame())
     with pytest.raises(
         InputError,
-        match=r"the state is of frames of \(1, 3, 24, 32\), found one of \(1, 3, 20, 32\), .*reset the denoiser",
+        match=r"\(1, 3, 24, 32\).*\(1, 3, 20, 32\)",
     ) as caught:
         denoiser(frame((20, 32)))
     assert "\n" not in str(caught.value)
@@ -224,7 +224,7 @@ def test_a_module_that_returns_an_output_alone_lacks_a_state() -> None:
         def forward(self, frame: Frame, state: State = None) -> Output:  # type: ignore[override]
             return Output(frame.color)
 
-    with pytest.raises(InputError, match=r"expected a pair \(Output, state\), found Output"):
+    with pytest.raises(InputError, match=r"\(Output, state\).* Output"):
         Denoiser(Alone())(frame())
 
 

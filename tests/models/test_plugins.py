@@ -83,7 +83,7 @@ def test_it_hinders_no_other(site: Path) -> None:
     assert torch.equal(Denoiser("noisy")(frame), frame.color)
     assert create_model("svgf").needs.buffers
     assert "kpcn" in users_of(["albedo"])["albedo"]
-    with pytest.raises(InputError, match=r"a model that does without: .*joint_bilateral"):
+    with pytest.raises(InputError, match="joint_bilateral"):
         Denoiser(lambda color, albedo: color)(frame)
     with pytest.raises(InputError, match="did you mean"):
         create_model("svgff")

@@ -28,7 +28,7 @@ def test_all_are_given_the_same_accumulation(name: str) -> None:
 @pytest.mark.parametrize("name", ["kp", "kpcn", "layered", "mrkp", "sbmc"])
 @pytest.mark.parametrize("kernel_size", [0, 4, -3])
 def test_a_kernel_without_a_centre_is_refused(name: str, kernel_size: int) -> None:
-    with pytest.raises(InputError, match=f"^kernel_size: expected odd and at least 1, found {kernel_size}$"):
+    with pytest.raises(InputError, match=f"^kernel_size: .* {kernel_size}$"):
         create_model(name, kernel_size=kernel_size)
 
 

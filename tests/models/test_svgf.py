@@ -180,7 +180,7 @@ def test_has_no_weights_and_declares_its_needs() -> None:
     assert not model.needs.trainable
     assert model.needs.buffers == {"color", "normal", "depth"}
     for absent in ("normal", "depth"):
-        with pytest.raises(InputError, match=f"buffer '{absent}': the model needs it, found only"):
+        with pytest.raises(InputError, match=f"buffer '{absent}':"):
             Denoiser("svgf")(frame().replace(**{absent: None}))
     wrong = {"alpha": 0.0, "levels": 0, "sigma_z": 0.0, "sigma_n": 0.5, "sigma_l": -1.0}
     for name, value in wrong.items():

@@ -171,7 +171,7 @@ def test_cycles_needs_a_blender(tmp_path: Path) -> None:
         "#!/bin/sh\ncase $2 in *blender.py) echo '{\"ok\": \"4.5\"}'; cat;; *) echo 'no light' >&2; exit 1;; esac\n"
     )
     broken.chmod(0o755)
-    with pytest.raises(InputError, match="tiny: Blender could not render it: no light"):
+    with pytest.raises(InputError, match=r"tiny: .*no light"):
         render_suite([shot], tmp_path / "data", blender_python=broken)
     assert rows_there([Row(shot, True)], tmp_path / "data") == []
 
