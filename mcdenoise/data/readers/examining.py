@@ -20,6 +20,7 @@ from mcdenoise.data.readers.samples import SampleLayers, mean_is
 from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
 from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Convention, motion_to, read_as, read_motion
 from mcdenoise.noise import noise_is_spread
+from mcdenoise.ops import use
 
 # Motion conventions known by layer name: Blender's points to the previous frame, in pixels, y up.
 _MOTION = {"vector": Convention(1, -1, "previous - current, y up, pixels")}
@@ -92,7 +93,10 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     color = np.nan_to_num(images["color"][..., :3])
     features = {"albedo": albedo, "normal": np.nan_to_num(images["normal"]) if "normal" in images else None}
     given = {name: None if image is None else _as_tensor(image) for name, image in features.items()}
-    if noise_is_spread(_as_tensor(color), **given):
+    # Once a shot: to load the compiled form would take longer than plain torch does.
+    with use("torch"):
+        spread = noise_is_spread(_as_tensor(color), **given)
+    if spread:
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
             "as Mitsuba's default does; many denoisers leave such noise in, OIDN most: render with a box filter, or "
