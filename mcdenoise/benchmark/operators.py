@@ -296,7 +296,7 @@ def _error(entry: _Entry, device: str) -> float:
     for case in entry.op.cases:
         if case.kind == "ordinary":
             settings = case.settings
-            worst = max(worst, relative_error(replace(entry.op, function=on_device), case, entry.dtype))
+            worst = max(worst, relative_error(entry.op, case, entry.dtype, on_device))
     if worst == float("inf"):
         raise ArithmeticError("a result is NaN or infinite where float64 is not")
     return worst

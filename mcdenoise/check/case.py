@@ -1,8 +1,8 @@
-"""Types of the table of ops in :mod:`mcdenoise.check.cases`: an op and its test cases."""
+"""Types of the table of ops in :mod:`mcdenoise.check.cases`: an op and its test cases, and draws of their numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -14,6 +14,8 @@ from mcdenoise.ops.temporal import Surface
 Kind = Literal["ordinary", "stiff", "extreme"]
 Value = Tensor | list[Tensor] | Surface | None
 Inputs = dict[str, Value]
+# Takes a generator and a shape.
+Draw = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
@@ -49,60 +51,36 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Rounding:
-    """Magnitudes of intermediate values that an op rounds, for error bounds.
-
-    Every op is assumed to be backward stable: its result is the exact result of inputs that differ by a few rounding
-    errors. For ops whose intermediate values are larger than their inputs, this gives the magnitudes to use instead.
-
-    Args:
-        arguments: for some arguments, the magnitude whose rounding error counts as an error of the argument; by default
-            the magnitude of the argument itself.
-        result: a magnitude that is rounded in addition to the result.
-        gradients: for some arguments, the magnitude of terms that cancel in their gradient, for upstream gradients of
-            1. For example, the terms of the derivative of a quotient, ``n' / s - n s' / s^2``, may be much larger than
-            their difference.
-    """
-
-    arguments: Inputs = field(default_factory=dict)
-    result: float = 0.0
-    gradients: Inputs = field(default_factory=dict)
-
-
-def _no_more(inputs: Inputs, settings: dict[str, Any]) -> Rounding:
-    return Rounding()
-
-
-@dataclass(frozen=True)
 class Op:
     """An op with its test cases and properties.
 
     Args:
-        function: the public function.
-        reference: its equation as loops in float64; see :mod:`mcdenoise.check.reference`.
+        function: the public function. In float64 it is the reference of all other dtypes and backends.
         cases: at least four cases, including ordinary ones.
         module: the Module twin, if there is one.
         least_dtype: minimum precision of the results; by default they have the dtype of the inputs.
         images: the arguments that are images in the same unit: the first result scales with them, and is constant if
             they are constant and the weights sum to one.
         weights: whether, with these settings, the results are non-negative weights that sum to one over the channels.
-        rounding: returns the :class:`Rounding` for inputs and settings.
+        rounds: magnitudes that the op rounds, of inputs and settings, for error bounds: for some arguments one whose
+            rounding error counts as an error of the argument, by default that of the argument itself; and as
+            ``"result"`` one that is rounded in addition to the result; and as ``"gradient of NAME"`` terms that cancel.
+            Ops are assumed to be backward stable, so that only those whose intermediate values are larger than their
+            inputs need it.
         half_precision: whether the op supports inputs in half precision.
         batched: whether the first axis of all tensors is the batch, and the op treats its images identically and
             independently, so that many inputs can be checked at once.
-        own: whether it is a user's function, see :mod:`mcdenoise.check.own`. Its reference is itself in float64, whose
-            derivatives are therefore checked first; it may combine the images of a batch; and in half precision its
-            intermediate values are rounded.
+        own: whether it is a user's function, see :mod:`mcdenoise.check.own`. Its derivatives in float64 are checked
+            first; it may combine the images of a batch; and in half precision its intermediate values are rounded.
     """
 
     function: Callable[..., Any]
-    reference: Callable[..., Any]
     cases: tuple[Case, ...]
     module: type[nn.Module] | None = None
     least_dtype: torch.dtype | None = None
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
-    rounding: Callable[[Inputs, dict[str, Any]], Rounding] = _no_more
+    rounds: Callable[[Any, dict[str, Any]], Mapping[str, Any]] = lambda inputs, settings: {}
     half_precision: bool = True
     batched: bool = True
     own: bool = False
@@ -126,6 +104,11 @@ def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
     return {name: apply(value) for name, value in inputs.items()}
 
 
+def as_tuple(results: Any) -> tuple[Tensor, ...]:
+    """The results of an op, of which there may be one or several."""
+    return (results,) if isinstance(results, Tensor) else tuple(results)
+
+
 def uniform(g: Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
     """Uniformly distributed numbers in ``[low, high)``, float64."""
     return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
@@ -139,3 +122,46 @@ def normal(g: Generator, *shape: int) -> Tensor:
 def radiance(g: Generator, *shape: int) -> Tensor:
     """Radiance over six decades, as in renderings of one sample per pixel: mostly dark, with fireflies up to 1e4."""
     return 10 ** uniform(g, *shape, low=-2, high=4)
+
+
+def dim(g: Generator, *shape: int) -> Tensor:
+    """Radiance over six decades, with fireflies up to 100, beside which finite differences are accurate."""
+    return radiance(g, *shape) / 100
+
+
+def constant(value: float) -> Draw:
+    """The same number everywhere."""
+
+    def draw(g: Generator, *shape: int) -> Tensor:
+        return torch.full(shape, value, dtype=torch.float64)
+
+    return draw
+
+
+def between(low: float, high: float) -> Draw:
+    """Uniformly distributed numbers."""
+
+    def draw(g: Generator, *shape: int) -> Tensor:
+        return uniform(g, *shape, low=low, high=high)
+
+    return draw
+
+
+def times(factor: float, draw: Draw, offset: float = 0.0) -> Draw:
+    """Numbers of another distribution, scaled, and moved."""
+    return lambda g, *shape: offset + factor * draw(g, *shape)
+
+
+def alternating(size: float) -> Draw:
+    """A checkerboard of both signs, for which sums over neighbours cancel."""
+
+    def draw(g: Generator, *shape: int) -> Tensor:
+        signs = 1 - 2 * (torch.arange(shape[-2])[:, None] + torch.arange(shape[-1])) % 2
+        return size * signs * (1 + 0.1 * uniform(g, *shape))
+
+    return draw
+
+
+def softmax(spread: float, total: float = 1.0) -> Draw:
+    """Weights of that sum; the larger the spread, the closer to a single one."""
+    return lambda g, *shape: total * torch.softmax(spread * normal(g, *shape), 1)

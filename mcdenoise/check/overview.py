@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from mcdenoise.check.case import as_tuple, map_tensors
 from mcdenoise.check.cases import OPS, Case, Op
+from mcdenoise.ops import use
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
@@ -36,7 +38,7 @@ class OpOverview:
 
 
 def overview() -> list[OpOverview]:
-    """Summarize every op; this measures its errors against its equation in float64."""
+    """Summarize every op; this measures its errors against float64."""
     return [
         OpOverview(
             name=op.name,
@@ -55,30 +57,30 @@ def overview() -> list[OpOverview]:
     ]
 
 
-def relative_error(op: Op, case: Case, dtype: torch.dtype) -> float:
-    """``max |out - reference| / max |reference|``, the maximum over the op's results.
+def relative_error(op: Op, case: Case, dtype: torch.dtype, function: Callable[..., Any] | None = None) -> float:
+    """``max |out - exact| / max |exact|``, the maximum over the op's results.
 
-    Both get the same inputs, rounded to ``dtype``; the reference computes in float64. Where the reference exceeds the
-    range of ``dtype``, the result must be infinite; any other infinite or NaN result is an infinite error.
+    Both get the same inputs, rounded to ``dtype``; the exact result is that of plain torch in float64. Where it exceeds
+    the range of ``dtype``, the result must be infinite; any other infinite or NaN result is an infinite error.
+
+    Args:
+        op: an op of the table.
+        case: one of its cases.
+        dtype: dtype of the inputs.
+        function: what to measure; by default the op itself.
     """
     inputs = case.inputs(dtype)
-    results = op.function(**inputs, **case.settings)
-    references = op.reference(**inputs, **case.settings)
-    return max(
-        _relative_error(out, reference)
-        for out, reference in zip(_as_sequence(results), _as_sequence(references), strict=True)
-    )
+    results = as_tuple((function or op.function)(**inputs, **case.settings))
+    with use("torch"):
+        exact = as_tuple(op.function(**map_tensors(Tensor.double, inputs), **case.settings))
+    return max(_relative_error(one, other) for one, other in zip(results, exact, strict=True))
 
 
-def _as_sequence(results: Any) -> Sequence[Tensor]:
-    return (results,) if isinstance(results, Tensor) else results
-
-
-def _relative_error(out: Tensor, reference: Tensor) -> float:
-    representable = torch.isfinite(reference.to(out.dtype))
+def _relative_error(out: Tensor, exact: Tensor) -> float:
+    representable = torch.isfinite(exact.to(out.dtype))
     if not torch.equal(torch.isfinite(out), representable):
         return float("inf")
     if not out.numel():
         return 0.0
-    difference = torch.where(representable, out.double() - reference, 0).abs().max().item()
-    return difference / max(torch.where(representable, reference, 0).abs().max().item(), torch.finfo(out.dtype).tiny)
+    difference = torch.where(representable, out.double() - exact, 0).abs().max().item()
+    return difference / max(torch.where(representable, exact, 0).abs().max().item(), torch.finfo(out.dtype).tiny)

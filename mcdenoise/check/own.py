@@ -123,7 +123,7 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         raise InputError(f"function '{name}': expected a function of tensors, found {type(function).__name__}")
     called = _by_name(name, function)
     if examples is None:
-        return Op(called, called, _image_cases(name, function), batched=False, own=True)
+        return Op(called, _image_cases(name, function), batched=False, own=True)
     given = examples if isinstance(examples, Mapping) else {"example": examples}
     if not given:
         raise InputError(f"function '{name}': expected example inputs by name, found none")
@@ -132,7 +132,6 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         _check_tensors(where, tensors)
         _check_results(where, function, tensors)
     return Op(
-        called,
         called,
         tuple(_case(str(case), function, tensors) for case, tensors in given.items()),
         batched=False,

@@ -1,6 +1,6 @@
 """The table of fused steps with their test cases, like :mod:`mcdenoise.check.cases` for the public ops.
 
-The reference of a step is its formula in float64, written with torch's primitives or with other references.
+Their formulas in float64 are in ``tests/oracles/steps.py``.
 """
 
 from __future__ import annotations
@@ -11,12 +11,10 @@ from functools import partial
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Generator, Tensor
 
-from mcdenoise.check import reference
+from mcdenoise.check import _temporal
 from mcdenoise.check.case import Case, Inputs, Op, normal, uniform
-from mcdenoise.check.extreme import history_rounding
 from mcdenoise.ops._steps import history, network
 
 Size = tuple[int, int, int]
@@ -101,78 +99,16 @@ def _history(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
     }
 
 
-def _normalized(depth: Tensor, scale: list[Tensor]) -> Tensor:
-    near, typical = (each.double() for each in scale)
-    depth = depth.double()
-    return torch.where(depth.isinf(), 1, 1 - 1 / (1 + torch.where(depth.isinf(), 1, depth) / (near * typical)))
-
-
-def _of_buffers(
-    image: Tensor,
-    albedo: Tensor,
-    normal: Tensor,
-    depth: Tensor,
-    current: Tensor,
-    length: Tensor,
-    exposure: Tensor,
-    scale: list[Tensor],
-) -> Tensor:
-    lit = torch.log(1 + current.double() * exposure.double())
-    features = [albedo.double(), (normal.double() + 1) / 2, _normalized(depth, scale), lit, 1 / length.double()]
-    return torch.cat([torch.log(1 + image.double()), *features], 1)
-
-
-def _gated_fusion(fine: Tensor, coarse: Tensor, weight: Tensor, bias: Tensor, *, logarithms: bool = False) -> Tensor:
-    fine, coarse, weight, bias = fine.double(), coarse.double(), weight.double(), bias.double()
-    size = (fine.shape[-2], fine.shape[-1])
-    wide, low = reference.upsample(coarse, size), reference.upsample(reference.downsample(fine), size)
-    detail = torch.log(1 + fine) if logarithms else fine
-    alpha = torch.sigmoid(F.conv2d(torch.cat([detail, wide], 1), weight, bias, padding=1))
-    return detail + alpha * (wide - (torch.log(1 + low) if logarithms else low))
-
-
-def _incoming(color: Tensor, albedo: Tensor) -> Tensor:
-    clamped = reference.clamp_fireflies(reference.demodulate(color, albedo))
-    mean = clamped.mean(1, keepdim=True)
-    return torch.cat([clamped, mean**0.25, mean**0.5], 1)
-
-
-def _lights(root: Tensor) -> Tensor:
-    root = root.double()
-    batch, _, height, width = root.shape
-    found = torch.zeros_like(root)
-    for b in range(batch):
-        image = root[b, 0]
-        for top in range(height - 2):
-            for left in range(width - 2):
-                block = image[top : top + 3, left : left + 3]
-                if block.max() - block.min() <= 0.03 * block.max():
-                    found[b, 0, top : top + 3, left : left + 3] = 1
-        for y in range(height):
-            for x in range(width):
-                window = image[max(y - 4, 0) : y + 5, max(x - 4, 0) : x + 5]
-                found[b, 0, y, x] *= image[y, x] > 1.2 * window.mean()
-    return found
-
-
-def _blend(
-    entering: Tensor, previous: Tensor, previous_length: Tensor, motion: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    color, length = reference.accumulate(entering, previous, previous_length, motion)
-    return color, length, (length > 1).double().mean((1, 2, 3))
-
-
 _BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
 
 # Between accumulation and a network's convolutions frames are in float32, so steps need not support half precision.
 STEPS: tuple[Op, ...] = tuple(
     replace(step, half_precision=False)
     for step in (
-        Op(network.buffers_input, _of_buffers, _cases(_buffers_input, ("image", *_BUFFERS))),
+        Op(network.buffers_input, _cases(_buffers_input, ("image", *_BUFFERS))),
         # Its weights have no batch axis.
         Op(
             network.gated_fusion,
-            _gated_fusion,
             (
                 *_cases(_fusion, ("fine", "coarse", "weight", "bias")),
                 Case(
@@ -185,13 +121,12 @@ STEPS: tuple[Op, ...] = tuple(
             ),
             batched=False,
         ),
-        Op(history.incoming, _incoming, _cases(_entering, ()), least_dtype=torch.float32),
-        Op(history.lights, _lights, _cases(_root, ())),
+        Op(history.incoming, _cases(_entering, ()), least_dtype=torch.float32),
+        Op(history.lights, _cases(_root, ())),
         Op(
             history.blend,
-            _blend,
             _cases(partial(_history, (3, 3)), ("entering", "previous", "motion")),
-            rounding=lambda inputs, settings: history_rounding({**inputs, "color": inputs["entering"]}, settings),
+            rounds=_temporal.motion_rounds,
         ),
     )
 )

@@ -53,7 +53,7 @@ def result_of(function: object, order: int = 2, width: int = 2) -> tuple[bool, s
         Case(f"{size} pixels", "ordinary", lambda g, size=size: {"image": uniform(g, 1, 1, 2, size)}, ("image",))
         for size in (2, width)
     ]
-    op = Op(function, function, tuple(cases))  # type: ignore[arg-type]
+    op = Op(function, tuple(cases))  # type: ignore[arg-type]
     result = check_case(op, cases[1], order)
     return result.passed, result.message
 

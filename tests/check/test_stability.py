@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mpmath
 import pytest
 import torch
 from torch import Tensor
@@ -43,29 +42,13 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
     return op
 
 
-# bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes.
-# Ops whose many taps or cases take a quarter of a minute or more, most of it for second derivatives.
-LONG = {
-    *("atrous", "softmax_splat", "affinity_filter", "importance_filter", "moments_variance", "accumulate"),
-    *("kernel_conv", "temporal_gradient", "grid_splat", "reproject"),
-}
-TRIED = [
-    pytest.param(op, dtype, marks=[pytest.mark.slow] if op.name in LONG or dtype == torch.float16 else [])
-    for op in OPS
-    for dtype in (torch.float32, torch.float16)
-]
-
-
-@pytest.mark.parametrize(("op", "dtype"), TRIED, ids=lambda value: getattr(value, "name", str(value)))
-def test_every_op_is_stable(op: Op, dtype: torch.dtype) -> None:
-    checks = list(check_op(op, (dtype,)))
+# bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes and cases.
+@pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+def test_every_op_is_stable(op: Op) -> None:
+    checks = list(check_op(op, (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
-    assert {check.case for check in checks if check.what == "forward"} == {case.name for case in op.cases}
-    assert {check.case for check in checks if check.what == "gradient"} == {case.name for case in op.cases}
-
-
-def test_every_op_has_stiff_or_extreme_cases() -> None:
-    assert all(sum(case.kind != "ordinary" for case in op.cases) >= 5 for op in OPS)
+    for what in ("forward", "gradient"):
+        assert {check.case for check in checks if check.what == what} == {case.name for case in op.cases}
 
 
 def test_sums_in_half_precision_fail() -> None:
@@ -78,7 +61,7 @@ def test_sums_in_half_precision_fail() -> None:
             total = total + tap
         return total
 
-    cases = tuple(case for case in BY_NAME["kernel_conv"].cases if case.settings["border"] == "zeros")[:2]
+    cases = tuple(case for case in BY_NAME["kernel_conv"].cases if case.settings.get("border") == "zeros")[:2]
     assert "forward" in failures(like("kernel_conv", halved, cases=cases), torch.bfloat16)
     # In float32 the same sum is accurate enough.
     assert not failures(like("kernel_conv", halved, cases=cases), torch.float32).get("forward")
@@ -95,10 +78,10 @@ def test_a_softmax_that_overflows_fails() -> None:
         weights = falloff * torch.exp(kernel)
         return weights / weights.sum(1, keepdim=True)
 
-    cases = tuple(case for case in op.cases if case.settings["normalize"] == "softmax")
+    cases = tuple(case for case in op.cases if case.settings.get("normalize") != "none")
     found = failures(like("cross_bilateral_weights", naive, cases=cases))
     assert {"logits to +-1e4", "logits of -1e4", "logits 1e4 and 1 apart"} <= found["forward"] & found["weights"]
-    assert "softmax" not in found["forward"]
+    assert not found["forward"] & {case.name for case in cases if case.kind == "ordinary"}
 
 
 def test_a_nan_gradient_fails() -> None:
@@ -152,35 +135,6 @@ def test_backends_are_checked_and_unavailable_ones_are_reported(monkeypatch: pyt
     (told,) = check_case(tried, case, torch.float32, "numba")
     assert told.passed
     assert "is not there" in told.message
-
-
-def test_the_reference_of_an_exponent_beyond_float64() -> None:
-    """The reference agrees with mpmath at 60 digits."""
-    op = BY_NAME["cross_bilateral_weights"]
-    case = next(case for case in op.cases if case.name == "logits to +-1e4")
-    inputs = case.inputs()
-    weights = op.reference(**inputs, **case.settings)
-    logits, guide, scale, distance = (
-        inputs["kernel"],
-        inputs["guides"][0],
-        inputs["falloffs"][0],
-        inputs["distance_falloff"],
-    )
-    with mpmath.workdps(60):
-        for y, x in ((0, 0), (1, 2), (0, 1)):
-            exact = {}
-            for tap in range(9):
-                row, column = y + tap // 3 - 1, x + tap % 3 - 1
-                if 0 <= row < logits.shape[2] and 0 <= column < logits.shape[3]:
-                    difference = mpmath.mpf(guide[0, 0, row, column].item()) - mpmath.mpf(guide[0, 0, y, x].item())
-                    exponent = mpmath.mpf(logits[0, tap, y, x].item())
-                    exponent -= mpmath.mpf(scale[0, 0, y, x].item()) * difference**2
-                    exponent -= mpmath.mpf(distance[0, 0, y, x].item()) * ((row - y) ** 2 + (column - x) ** 2)
-                    exact[tap] = mpmath.exp(exponent)
-            total = sum(exact.values())
-            for tap in range(9):
-                expected = float(exact.get(tap, mpmath.mpf(0)) / total)
-                assert weights[0, tap, y, x].item() == pytest.approx(expected, rel=1e-11, abs=1e-300)
 
 
 def test_a_model_is_stable() -> None:

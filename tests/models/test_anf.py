@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from oracles import filters
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 from toys import frame_of, small, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.check import reference
 from mcdenoise.export import export_model
 from mcdenoise.models import Demodulated
 from mcdenoise.models.anf import Anf
@@ -82,7 +82,7 @@ def test_the_method_is_its_equations() -> None:
                 warped = from_the_right(result), from_the_right(features)
                 temporal = (*warped, predicted[:, 31:].square(), known)
             center = 1 / (1 + torch.exp(-c))
-            image = reference.affinity_filter(image, f, a.square(), center, *temporal, kernel_size=7, dilation=2**k)
+            image = filters.affinity_filter(image, f, a.square(), center, *temporal, kernel_size=7, dilation=2**k)
         result, features = image, f
         torch.testing.assert_close(output.image, image, rtol=1e-9, atol=1e-12)
     # Something is kept, and not all.

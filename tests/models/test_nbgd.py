@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from oracles import resolutions
 from test_cascaded import drawn, features, frame_of_doubles
 from torch import Tensor
 from toys import refused, small, whole_frame
 
-from mcdenoise.check import reference
 from mcdenoise.frame import Frame
 from mcdenoise.models import Tiled, create_model, parts_of
 from mcdenoise.models.nbgd import NeuralBilateralGrid
@@ -40,8 +40,8 @@ def predicted(network: NeuralBilateralGrid, frame: Frame, light: Tensor) -> Tens
 
 
 def of_grid(image: Tensor, guide: Tensor, cell: int, bins: int) -> Tensor:
-    grid, filled = reference.grid_splat(image, guide, cell=cell, bins=bins)
-    return reference.grid_slice(grid, filled, guide, cell=cell)
+    grid, filled = resolutions.grid_splat(image, guide, cell=cell, bins=bins)
+    return resolutions.grid_slice(grid, filled, guide, cell=cell)
 
 
 def combined(predicted: Tensor, image: Tensor) -> Tensor:

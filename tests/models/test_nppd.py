@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from oracles import filters, history, resolutions
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 from toys import refused, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.check import reference
 from mcdenoise.models import create_model
 from mcdenoise.models.nppd import History, Nppd
 from mcdenoise.ops import reproject
@@ -108,22 +108,22 @@ def predicted(model: Any, seen: Tensor) -> list[Tensor]:
 def written_out(model: Any, frame: Frame, state: History | None) -> tuple[Tensor, History]:
     """A step."""
     zeros = torch.zeros(1, 38, *SIZE, dtype=torch.float64)
-    before = zeros if state is None else reference.reproject(torch.cat(state[:3], 1), frame.motion)[0]
+    before = zeros if state is None else history.reproject(torch.cat(state[:3], 1), frame.motion)[0]
     mean, image, features = before[:, :3], before[:, 3:6], before[:, 6:]
     own = encoded(model, frame)
     fine, *coarse = predicted(model, torch.cat([logarithm(torch.cat([mean, frame.color], 1)), features, own], 1))
     trust, mix = (1 / (1 + torch.exp(-fine[:, index : index + 1])) for index in (51, 50))
     mean = trust * mean + (1 - trust) * frame.color
     features = trust * features + (1 - trust) * own
-    parts = reference.pyramid_partition(mean, fine[:, 52:])
+    parts = resolutions.pyramid_partition(mean, fine[:, 52:])
 
     def splatted(part: Tensor, logits: Tensor) -> Tensor:
-        return reference.kernel_splat(part, torch.softmax(logits, 1), border="zeros")
+        return filters.kernel_splat(part, torch.softmax(logits, 1), border="zeros")
 
     result = splatted(parts[4], coarse[3][:, :25])
     for level in (3, 2, 1, 0):
         kernel = 4 * torch.softmax(coarse[level][:, 25:], 1)
-        up = reference.learned_upsample(result, kernel, (*parts[level].shape[-2:],), border="zeros")
+        up = resolutions.learned_upsample(result, kernel, (*parts[level].shape[-2:],), border="zeros")
         result = splatted(parts[level], (fine, *coarse)[level][:, :25]) + up
     result = mix * splatted(image, fine[:, 25:50]) + (1 - mix) * result
     return result, History(mean, result, features, None)

@@ -10,40 +10,21 @@ from typing import Any
 
 import pytest
 import torch
+from oracles import oracle
 from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.check import gradients
+from mcdenoise.check.case import as_tuple
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.check.overview import DTYPES, overview, relative_error
+from mcdenoise.check.overview import DTYPES, overview
 from mcdenoise.errors import InputError
 
-# It is relative to the largest absolute value of a result. Half precision is rounded once, after a sum in float32, or
-# a few times by the ops that have no sum; float32 is rounded at every tap, and an exponent near 50 is known to 50 eps.
-# Measured at most: 0.6 eps for half precision, 3 eps for float32 and float64.
-TOLERANCE = {
-    torch.float64: 1e-10,
-    torch.float32: 16 * torch.finfo(torch.float32).eps,
-    torch.bfloat16: 2 * torch.finfo(torch.bfloat16).eps,
-    torch.float16: 2 * torch.finfo(torch.float16).eps,
-}
-
-# Denormal numbers have fewer digits, an exponent of 1e4 is known to 1e4 eps, and 1e-4 rounded is on either side of what
-# counts as albedo, a difference of moments is known to their own eps: `mcdenoise stability` has their bounds.
-ILL_CONDITIONED = re.compile(r"constant 1e-40|logits (of -|)1e4|albedo 0.0001|moments that cancel")
-
 every_op = pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
-every_case = pytest.mark.parametrize(
-    ("op", "case"), [pytest.param(op, case, id=f"{op.name}-{case.name}") for op in OPS for case in op.cases]
-)
 
 
 def results_of(op: Op, inputs: Inputs, case: Case) -> Sequence[Tensor]:
-    return as_sequence(op.function(**inputs, **case.settings))
-
-
-def as_sequence(results: Any) -> Sequence[Tensor]:
-    return (results,) if isinstance(results, Tensor) else results
+    return as_tuple(op.function(**inputs, **case.settings))
 
 
 def tensors_in(inputs: Inputs) -> list[Tensor]:
@@ -52,11 +33,15 @@ def tensors_in(inputs: Inputs) -> list[Tensor]:
     return found
 
 
-def assert_same(actual: Sequence[Tensor], expected: Sequence[Tensor], rtol: float = 1e-10) -> None:
+def assert_same(actual: Sequence[Tensor], expected: Sequence[Tensor], rtol: float = 1e-10, note: str = "") -> None:
     for a, e in zip(actual, expected, strict=True):
         # Sums that cancel are known to a fraction of their terms only.
         scale = torch.where(torch.isfinite(e), e, 0).abs().max().item() if e.numel() else 0.0
-        torch.testing.assert_close(a, e, rtol=rtol, atol=1e-4 * rtol * scale, equal_nan=True)
+        try:
+            torch.testing.assert_close(a, e, rtol=rtol, atol=1e-4 * rtol * scale, equal_nan=True)
+        except AssertionError as error:
+            error.add_note(note)
+            raise
 
 
 def test_every_public_function_is_in_the_table() -> None:
@@ -68,47 +53,31 @@ def test_every_public_function_is_in_the_table() -> None:
 @every_op
 def test_cases_are_named_and_cover_what_is_differentiable(op: Op) -> None:
     names = [case.name for case in op.cases]
-    assert len(names) == len(set(names)) >= 4
+    assert len(names) == len(set(names))
     assert sum(case.kind == "ordinary" for case in op.cases) >= 4
+    assert sum(case.kind != "ordinary" for case in op.cases) >= 5
     tensors = {name for case in op.cases for name in case.inputs()}
     differentiable = {name for case in op.cases for name in case.differentiable}
     assert tensors - differentiable <= {"surface", "previous_surface"}
 
 
-@every_case
-def test_equals_the_equation_in_float64(op: Op, case: Case) -> None:
-    inputs = case.inputs()
-    references = as_sequence(op.reference(**inputs, **case.settings))
-    assert_same(results_of(op, inputs, case), references)
-
-
-# One test for all dtypes, and below one for all layouts: of hundreds of cases tests cost more than the ops in them.
-@every_case
-def test_error_is_that_of_rounding(op: Op, case: Case) -> None:
-    for dtype, tolerance in TOLERANCE.items():
-        # The error in float64 is tested above, number by number.
-        if dtype != torch.float64 and not ILL_CONDITIONED.match(case.name):
-            assert relative_error(op, case, dtype) <= tolerance, dtype
-        expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)
-        assert {result.dtype for result in results_of(op, case.inputs(dtype), case)} == {expected}, dtype
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+# One test of all cases: of hundreds of cases tests cost more than the ops in them.
 @every_op
-def test_gradients_in_half_precision(op: Op, dtype: torch.dtype) -> None:
-    case = op.cases[1]
-    gradients = {}
-    for kind in (dtype, torch.float64):
-        # The same numbers in both, so that only the arithmetic differs.
-        inputs = map_tensors(lambda tensor, kind=kind: tensor.to(kind), case.inputs(dtype))
-        leaves = [x.requires_grad_() for x in tensors_in({name: inputs[name] for name in case.differentiable})]
-        results = [result for result in results_of(op, inputs, case) if result.requires_grad]
-        gradients[kind] = torch.autograd.grad([result.sum() for result in results], leaves)
-        assert {gradient.dtype for gradient in gradients[kind]} == {kind}
-    for half, exact in zip(gradients[dtype], gradients[torch.float64], strict=True):
-        scale = max(exact.abs().max().item(), 1.0)
-        # A gradient is a sum of several products, each rounded, and autograd rounds between the steps of an op.
-        assert (half.double() - exact).abs().max().item() <= 8 * torch.finfo(dtype).eps * scale
+def test_equals_the_equation_in_float64(op: Op) -> None:
+    for case in op.cases:
+        inputs = case.inputs()
+        expected = as_tuple(oracle(op.name)(**inputs, **case.settings))
+        assert_same(results_of(op, inputs, case), expected, note=case.name)
+        # Inputs are left alone.
+        assert_same(tensors_in(inputs), tensors_in(case.inputs()), rtol=0)
+
+
+@every_op
+def test_results_have_the_dtype_of_the_inputs(op: Op) -> None:
+    for dtype in (torch.float64, *DTYPES):
+        expected = dtype if op.least_dtype is None else torch.promote_types(dtype, op.least_dtype)
+        for case in op.cases[:2]:
+            assert {result.dtype for result in results_of(op, case.inputs(dtype), case)} == {expected}, dtype
 
 
 @every_op
@@ -116,17 +85,6 @@ def test_gradcheck(op: Op) -> None:
     results = gradients.check([op.name])
     assert [result.case for result in results] == [case.name for case in op.cases if case.differentiable]
     assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
-
-
-def test_gradcheck_reports_a_wrong_derivative() -> None:
-    def detached(image: Tensor) -> Tensor:
-        return image * image.detach()
-
-    case = Case("square", "ordinary", lambda g: {"image": torch.rand(1, 1, 2, 2, generator=g).double()}, ("image",))
-    result = gradients.check_case(Op(detached, detached, (case,)), case)
-    assert (result.op, result.case, result.passed) == ("detached", "square", False)
-    assert "Jacobian mismatch" in result.message
-    assert "\n" not in result.message
 
 
 def test_gradcheck_of_an_unknown_op() -> None:
@@ -150,24 +108,14 @@ def expanded(tensor: Tensor) -> Tensor:
     return tensor[:1].expand(2 * min(len(tensor), 1), *tensor.shape[1:])
 
 
-@every_case
-def test_layout_in_memory_changes_nothing(op: Op, case: Case) -> None:
-    for layout in (transposed, channels_last, strided, expanded):
-        inputs = map_tensors(layout, case.inputs())
-        contiguous = map_tensors(lambda tensor: tensor.contiguous(), inputs)
-        try:
-            assert_same(results_of(op, inputs, case), results_of(op, contiguous, case), rtol=1e-12)
-        except AssertionError as error:
-            error.add_note(f"layout: {layout.__name__}")
-            raise
-
-
-@every_case
-def test_inputs_are_left_alone(op: Op, case: Case) -> None:
-    inputs = case.inputs()
-    results_of(op, inputs, case)
-    for after, before in zip(tensors_in(inputs), tensors_in(case.inputs()), strict=True):
-        torch.testing.assert_close(after, before, rtol=0, atol=0, equal_nan=True)
+@every_op
+def test_layout_in_memory_changes_nothing(op: Op) -> None:
+    for case in (case for case in op.cases if case.kind != "extreme"):
+        for layout in (transposed, channels_last, strided, expanded):
+            inputs = map_tensors(layout, case.inputs())
+            contiguous = map_tensors(lambda tensor: tensor.contiguous(), inputs)
+            note = f"{case.name}, {layout.__name__}"
+            assert_same(results_of(op, inputs, case), results_of(op, contiguous, case), rtol=1e-12, note=note)
 
 
 # Generating code takes five to thirty seconds for an op, a minute for one with many taps, and what there is to generate
@@ -208,12 +156,12 @@ def test_compiles_to_the_same(op: Op, case: Case, backend: str) -> None:
     for function in (op.function, compiled):
         inputs = case.inputs()
         leaves = [x.requires_grad_() for x in tensors_in({name: inputs[name] for name in case.differentiable})]
-        results = as_sequence(function(**inputs, **case.settings))
+        results = as_tuple(function(**inputs, **case.settings))
         total = sum((result * torch.arange(result.numel()).reshape(result.shape).cos()).sum() for result in results)
         outcomes.append([*(result.detach() for result in results), *torch.autograd.grad(total, leaves)])
     assert_same(outcomes[1], outcomes[0])
     # Without gradients the compiler takes another way through a function that has its own.
-    assert_same(as_sequence(compiled(**case.inputs(), **case.settings)), outcomes[0][: len(results)])
+    assert_same(as_tuple(compiled(**case.inputs(), **case.settings)), outcomes[0][: len(results)])
 
 
 @pytest.mark.parametrize("op", [op for op in OPS if op.module is not None], ids=lambda op: op.name)
@@ -222,7 +170,7 @@ def test_module_stores_settings_and_calls_the_function(op: Op) -> None:
         assert op.module is not None
         module = op.module(**case.settings)
         assert not list(module.parameters())
-        results = as_sequence(module(**case.inputs()))
+        results = as_tuple(module(**case.inputs()))
         for result, expected in zip(results, results_of(op, case.inputs(), case), strict=True):
             torch.testing.assert_close(result, expected, rtol=0, atol=0, equal_nan=True)
 
@@ -233,7 +181,8 @@ def test_overview() -> None:
     for entry in entries.values():
         assert entry.summary.endswith(".")
         assert set(entry.errors) == {str(dtype).removeprefix("torch.") for dtype in DTYPES}
-        assert all(entry.errors[str(dtype).removeprefix("torch.")] <= TOLERANCE[dtype] for dtype in DTYPES)
+        # Half precision is rounded once, after a sum in float32; float32 at every tap.
+        assert all(entry.errors[str(kind).removeprefix("torch.")] <= 16 * torch.finfo(kind).eps for kind in DTYPES)
     assert entries["accumulate"].differentiable == ("color", "previous", "previous_length", "motion")
     assert entries["accumulate"].module == "Accumulate"
     assert entries["reproject"].module is None

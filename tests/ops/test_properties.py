@@ -1,6 +1,6 @@
 """Properties of the ops on any input: hypothesis draws shapes, dtypes and values, and shrinks the inputs that fail.
 
-A failure that turns up here becomes a case of the table in ``mcdenoise/check/extreme.py``.
+A failure that turns up here becomes a row of the op in ``mcdenoise/check/``.
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
 """Errors of ops and their gradients, against bounds from rounding error analysis.
 
+An op is compared with itself in float64. There it is compared with its equation, written as loops, by tests, and its
+gradients with finite differences, by :mod:`mcdenoise.check.gradients`.
+
 The bound of a result ``y = f(x)`` is as follows. Let ``u`` be the unit roundoff of the dtype in which an op computes
 (float32 for half precision), and ``v`` that of the dtype of the result. A backward stable op returns the exact result
 of inputs that differ by at most ``n u`` times their magnitude ``s``, and rounds it:
@@ -9,19 +12,19 @@ of inputs that differ by at most ``n u`` times their magnitude ``s``, and rounds
 The sum is the (absolute, componentwise) condition number: the change of the exact result with that of the inputs. It is
 not computed from derivatives but measured in float64, by perturbing every input up and down by ``16 u``, so that it
 includes kinks and jumps within the reach of rounding. ``s_j`` is ``|x_j|``, at least the smallest normal number (below
-it there are fewer digits), and more for ops with larger intermediate values, see
-:class:`mcdenoise.check.case.Rounding`.
+it there are fewer digits), and more for ops with larger intermediate values, see ``rounds`` of
+:class:`mcdenoise.check.case.Op`.
 
 ``n`` is the number of rounding errors. A sum of ``m`` terms has ``m - 1``, and a result that depends on ``m`` inputs
 consists of sums of at most ``m`` terms; products, quotients and exponentials add at most 8. So ``n = m + 8``.
 
-The same holds for gradients, as functions of inputs and upstream gradient. There ``u`` is that of the dtype itself,
-because half-precision values are rounded when an op passes them to autograd.
+The terms of a gradient may cancel, although no input is ill-conditioned. So a gradient may differ from that in float64
+by as much as 4 times the rounding of every step of its computation changes it, see :mod:`._rounding`. There ``u`` is
+that of the dtype itself, because half-precision values are rounded when an op passes them to autograd.
 
-A user's function is compared with itself in float64. Its intermediate values are unknown, so ``u`` is that of the dtype
-itself for its results too, and its perturbed inputs are computed one by one. Its gradients in float64, with which those
-in other dtypes are compared, are first compared with finite differences. Where all inputs are finite, its results and
-its gradients must be finite in float64.
+A user's function may have intermediate values of any dtype: ``u`` is that of the dtype itself for its results too. It
+may combine the images of a batch: perturbed inputs are computed one by one. And its gradients must be as exact as its
+results: their bound is that of a function of the inputs and of the upstream gradient.
 """
 
 from __future__ import annotations
@@ -37,10 +40,11 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check import gradients
-from mcdenoise.check.case import Case, Inputs, Op, Rounding, map_tensors
+from mcdenoise.check.case import Case, Inputs, Op, as_tuple, map_tensors
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops import Surface, use
 from mcdenoise.ops._backend import Backend
@@ -51,6 +55,7 @@ from mcdenoise.own import in_one_line
 _DEPTH = 8
 _PROBE = 16
 _AT_ONCE = 256  # perturbed inputs in one batch
+_DRAWS, _ALLOWED = 32, 4
 _NOISE = 1e-12  # relative noise of float64: a vectorised exponential rounds its last elements differently
 _CONSTANT = 0.7
 # Scaling by powers of two does not round, so results must scale exactly: 1.2e-4 and 8.2e3.
@@ -73,9 +78,7 @@ class _Trial:
     @property
     def leaves(self) -> list[Tensor]:
         """The tensors that are rounded; surfaces are not, because they are only compared."""
-        found: list[Tensor] = []
-        map_tensors(lambda tensor: found.append(tensor) or tensor, self.numbers)  # type: ignore[func-returns-value]
-        return found
+        return _leaves(self.numbers)
 
     @property
     def images(self) -> list[str]:
@@ -89,7 +92,7 @@ class _Trial:
 
     @property
     def must_be_finite(self) -> bool:
-        """Whether float64 must be finite: a user's function is its own reference, and NaN would excuse any result."""
+        """Whether float64 must be finite: a user's function has no other reference, and NaN would excuse any result."""
         return self.op.own and _all_finite(self.leaves)
 
     @property
@@ -108,7 +111,7 @@ class _Trial:
         backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
         with use(backend) if backend else nullcontext():
             results = self.op.function(**given, **repeated, **self.case.settings)
-        return [results] if isinstance(results, Tensor) else list(results)
+        return list(as_tuple(results))
 
     def gradients(self, leaves: Sequence[Tensor]) -> list[Tensor]:
         """Gradients of the results; the last of ``leaves`` are the upstream gradients, the others the tensors."""
@@ -255,52 +258,52 @@ def _once(cache: Cache, what: str, find: Callable[..., list[_Exact]], *arguments
 
 
 def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
-    """The op's results by its equation, with their error bounds."""
+    """The op's results in float64, with their error bounds."""
     inputs = map_tensors(Tensor.double, trial.inputs)
-    references = trial.op.reference(**inputs, **trial.case.settings)
-    references = [references] if isinstance(references, Tensor) else list(references)
-    dtype = trial.inner
-    rounding = trial.op.rounding(inputs, trial.case.settings)
-    leaves = [leaf.double() for leaf in trial.leaves]
-    magnitudes = _magnitudes(trial, leaves, rounding, dtype)
-    conditions = _conditions(trial.run, leaves, magnitudes, dtype, at_once=trial.op.batched)
+    rounded = trial.op.rounds(inputs, trial.case.settings)
+    lost = rounded.get("result", 0.0)
+    leaves, tiny = [leaf.double() for leaf in trial.leaves], torch.finfo(trial.inner).tiny
+    values = {name: value for name, value in inputs.items() if name in trial.numbers}
+    values |= {name: value for name, value in rounded.items() if name in values}  # type: ignore[misc]
+    magnitudes = _leaves(map_tensors(lambda tensor: tensor.abs() + tiny, values))
+    conditions = _conditions(trial.run, leaves, magnitudes, trial.inner, at_once=trial.op.batched)
     return [
-        _bounded(reference, condition + rounding.result, fan_in, dtype, result.dtype)
-        for reference, result, (condition, fan_in) in zip(references, results, conditions, strict=True)
+        _bounded(value, condition + lost, fan_in, trial.inner, result.dtype)
+        for value, result, (condition, fan_in) in zip(trial.run(leaves), results, conditions, strict=True)
     ]
 
 
 def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact]) -> list[_Exact]:
     """The gradients of the op in float64, which gradcheck compares with finite differences, with their error bounds."""
-    rounding = trial.op.rounding(map_tensors(Tensor.double, trial.inputs), trial.case.settings)
     exact = [leaf.double() for leaf in leaves]
-    magnitudes = _magnitudes(trial, exact[: len(trial.leaves)], rounding, trial.dtype)
-    magnitudes += [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact[len(trial.leaves) :]]
-    conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
-    largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
-    cancelling = _by_leaf(trial, [torch.zeros_like(leaf) for leaf in exact[: len(trial.leaves)]], rounding.gradients)
+    if trial.op.own:
+        magnitudes = [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact]
+        conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
+    else:
+        unit = _unit(trial.dtype)
+        changes = spread(trial.gradients, exact, trial.dtype, _DRAWS, _ALLOWED)
+        rounded = trial.op.rounds(map_tensors(Tensor.double, trial.inputs), trial.case.settings)
+        terms = map_tensors(torch.zeros_like, trial.numbers)
+        terms |= {name: rounded[key] for name in terms if (key := f"gradient of {name}") in rounded}  # type: ignore[misc]
+        largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
+        conditions = [
+            (change / unit / _DEPTH + largest * term, torch.zeros_like(change))
+            for change, term in zip(changes, _leaves(terms), strict=True)
+        ]
     # If a result is rightly infinite, its derivative may be infinite or NaN; otherwise it must be finite. What must be
     # finite in any case stays as it is, so that it is reported.
     defined = not trial.must_be_finite and _all_finite([result.value for result in results])
     bounded = []
-    for value, terms, (condition, fan_in) in zip(trial.gradients(exact), cancelling, conditions, strict=True):
+    for value, (condition, fan_in) in zip(trial.gradients(exact), conditions, strict=True):
         excused = ~value.isnan() | (not defined)
-        condition = torch.where(excused, condition + largest * terms, 0)
+        condition = torch.where(excused, condition, 0)
         bounded.append(_bounded(torch.where(excused, value, 0), condition, fan_in, trial.dtype, trial.dtype))
     return bounded
 
 
-def _magnitudes(trial: _Trial, leaves: list[Tensor], rounding: Rounding, dtype: torch.dtype) -> list[Tensor]:
-    """The magnitudes whose rounding errors count as errors of the inputs."""
-    inner = _by_leaf(trial, [leaf.abs() for leaf in leaves], rounding.arguments)
-    return [magnitude + torch.finfo(dtype).tiny for magnitude in inner]
-
-
-def _by_leaf(trial: _Trial, defaults: list[Tensor], given: Inputs) -> list[Tensor]:
-    """One tensor for each leaf: the one given for its argument, or else its default."""
-    remaining, found = iter(defaults), list[Tensor]()
-    named = map_tensors(lambda _: next(remaining), trial.numbers)
-    map_tensors(lambda tensor: found.append(tensor) or tensor, named | given)  # type: ignore[func-returns-value]
+def _leaves(inputs: Inputs) -> list[Tensor]:
+    found: list[Tensor] = []
+    map_tensors(lambda tensor: found.append(tensor) or tensor, inputs)  # type: ignore[func-returns-value]
     return found
 
 
@@ -363,8 +366,9 @@ def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtyp
 def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
     """Compare results with exact ones; results beyond the range of the dtype must be infinite, all others finite."""
     values = [truth.value for truth in exact]
-    if trial.must_be_finite and not _all_finite(values):
-        kind = "NaN" if any(value.isnan().any() for value in values) else "infinity"
+    undefined = any(value.isnan().any() for value in values) and _all_finite(trial.leaves)
+    if undefined or (trial.must_be_finite and not _all_finite(values)):
+        kind = "NaN" if undefined else "infinity"
         return _found(trial, what, 0, 0, 0, f"{kind} in float64, where all inputs are finite")
     worst, highest, condition, message = (0.0, 0.0), 0.0, 0.0, ""
     for result, truth in zip(results, exact, strict=True):

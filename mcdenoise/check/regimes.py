@@ -1,0 +1,171 @@
+"""Regimes of inputs, by which every op is tried: ordinary sizes, fireflies, and the ends of what an image may hold.
+
+An op has a builder, ``build(g, size, image, **given)``, which draws its arguments for an image of that size from the
+generator ``g``; ``image`` draws what is radiance. :func:`crossed` gives the op all regimes, and rows of its own, in
+which other arguments are special.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from typing import Any
+
+from torch import Generator, Tensor
+
+from mcdenoise.check.case import Case, Draw, Inputs, Kind, alternating, constant, dim, normal, radiance, uniform
+
+Size = tuple[int, int, int, int]
+Builder = Callable[..., Inputs]
+_SETTING = inspect.Parameter.KEYWORD_ONLY
+
+# Tiny, because gradients are checked one element at a time, and odd, because errors at borders show there.
+ORDINARY: dict[str, Size] = {
+    "RGB, 3x5": (1, 3, 3, 5),
+    "batch of 2": (2, 1, 2, 3),
+    "one row, 5 channels": (1, 5, 1, 5),
+    "one pixel": (1, 3, 1, 1),
+}
+# Of ops whose many taps make a derivative expensive.
+SMALL: dict[str, Size] = {
+    "2x3": (1, 1, 2, 3),
+    "batch of 2": (2, 1, 1, 2),
+    "one row, RGB": (1, 3, 1, 4),
+    "one pixel": (1, 2, 1, 1),
+}
+
+
+def _forty_decades(g: Generator, *shape: int) -> Tensor:
+    return 10 ** uniform(g, *shape, low=-30, high=10)
+
+
+# Black, a denormal number, far below and far above the range of half precision, its end; neighbours that differ by all
+# that float32 holds, and neighbours that cancel.
+IMAGES: dict[str, Draw] = {
+    **{f"constant {value:g}": constant(value) for value in (0.0, 1e-40, 1e-30, 65504.0, 1e30)},
+    "six decades": radiance,
+    "forty decades": _forty_decades,
+    "alternating signs": alternating(6e4),
+}
+# Sizes that are difficult for borders, windows and strides.
+SIZES: dict[str, Size] = {
+    "one pixel": (1, 1, 1, 1),
+    "one row of 9": (1, 3, 1, 9),
+    "one column of 9": (1, 3, 9, 1),
+    "64 channels": (1, 64, 2, 3),
+    "no image": (0, 3, 2, 4),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A regime, or one that only one op has.
+
+    Args:
+        name: of the case.
+        kind: of the case.
+        size: of the image.
+        image: draws radiance.
+        smooth: the arguments in which finite differences are meaningful: all by default, and none at an extreme.
+        given: arguments of the builder, and settings of the op.
+    """
+
+    name: str
+    kind: Kind
+    size: Size
+    image: Draw
+    smooth: tuple[str, ...] | None
+    given: Mapping[str, Any]
+
+
+def ordinary(
+    name: str, size: Size = (1, 1, 2, 3), /, image: Draw = normal, smooth: tuple[str, ...] | None = None, **given: Any
+) -> Row:
+    """A row whose derivatives are checked."""
+    return Row(name, "ordinary", size, image, smooth, given)
+
+
+def stiff(
+    name: str, size: Size = (1, 1, 2, 3), /, image: Draw = normal, smooth: tuple[str, ...] | None = None, **given: Any
+) -> Row:
+    """A row in which results change fast with the inputs; its derivatives are checked too."""
+    return Row(name, "stiff", size, image, smooth, given)
+
+
+def extreme(
+    name: str, size: Size = (1, 3, 2, 4), /, image: Draw = radiance, smooth: tuple[str, ...] = (), **given: Any
+) -> Row:
+    """A row at the limits of valid input, of which the step of finite differences, 1e-6, is too large or too small."""
+    return Row(name, "extreme", size, image, smooth, given)
+
+
+FIREFLIES = stiff("fireflies", (1, 3, 2, 3), dim)
+
+
+def crossed(
+    function: Callable[..., Any],
+    build: Builder,
+    *rows: Row,
+    settings: Sequence[Mapping[str, Any]] = ({},),
+    sizes: Mapping[str, Size] = ORDINARY,
+    image: Draw = normal,
+    images: Mapping[str, Draw] = IMAGES,
+    fireflies: Row | None = FIREFLIES,
+    smooth: tuple[str, ...] | None = None,
+) -> tuple[Case, ...]:
+    """The cases of an op: all regimes, in turn with some settings, and rows of its own.
+
+    Args:
+        function: the op.
+        build: its builder.
+        rows: regimes that no other op has.
+        settings: of the op, and arguments of the builder; ordinary and extreme regimes take them in turn.
+        sizes: of the ordinary regimes.
+        image: of the ordinary regimes.
+        images: of the extreme regimes; there are none for an op without one.
+        fireflies: the regime of fireflies.
+        smooth: of the ordinary regimes.
+    """
+    usual = [
+        Row(_named(name, given), "ordinary", size, image, smooth, given)
+        for (name, size), given, _ in zip(
+            cycle(sizes.items()), cycle(settings), range(max(len(sizes), len(settings))), strict=False
+        )
+    ]
+    tried = [(name, (1, 3, 2, 4), draw) for name, draw in images.items()]
+    tried += [(f"{name}, six decades", size, radiance) for name, size in SIZES.items() if images]
+    limits = [
+        Row(_named(name, given), "extreme", size, draw, (), given)
+        for (name, size, draw), given in zip(tried, cycle(settings), strict=False)
+    ]
+    bright = [] if fireflies is None else [fireflies]
+    return tuple(_case(function, build, row) for row in (*usual, *bright, *rows, *limits))
+
+
+def _named(name: str, given: Mapping[str, Any]) -> str:
+    parts = (f"{key} {value}" for key, value in given.items() if not callable(value))
+    return ", ".join([name, *parts])
+
+
+def _case(function: Callable[..., Any], build: Builder, row: Row) -> Case:
+    parameters = inspect.signature(function).parameters
+    takes = inspect.signature(build).parameters
+    settings = {
+        key: value for key, value in row.given.items() if key in parameters and parameters[key].kind == _SETTING
+    }
+    if "size" in parameters:
+        settings["size"] = row.size[2:]
+    knobs = {key: value for key, value in row.given.items() if key in takes}
+    if unknown := row.given.keys() - settings.keys() - knobs.keys():
+        raise TypeError(f"{function.__name__}, {row.name}: neither the op nor its builder takes {sorted(unknown)}")
+    draw = partial(build, size=row.size, image=row.image, **knobs)
+    smooth = row.smooth
+    if smooth is None:
+        drawn = draw(Generator().manual_seed(0))
+        smooth = tuple(
+            key for key, value in drawn.items() if isinstance(value, Tensor) or (value and type(value) is list)
+        )
+    return Case(row.name, row.kind, draw, smooth, settings)
