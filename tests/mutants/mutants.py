@@ -77,8 +77,8 @@ MUTANTS = tuple(
         (
             "cross_bilateral_weights",
             "ops/bilateral.py",
-            "distance_falloff, alpha=dy * dy + dx * dx",
-            "distance_falloff, alpha=abs(dy) + abs(dx)",
+            "(dy * dy + dx * dx) * distance_falloff",
+            "(abs(dy) + abs(dx)) * distance_falloff",
         ),
         ("atrous", "ops/_edges.py", "weight.square() * variance", "weight * variance"),
         ("atrous", "ops/_edges.py", "forward.abs() < backward.abs()", "forward.abs() > backward.abs()"),
@@ -93,7 +93,7 @@ MUTANTS = tuple(
             "torch.softmax(logits.detach().to(dtype), 1)",
         ),
         ("accumulate", "ops/temporal.py", "base.long(), q - base", "base.long(), (q - base).detach()"),
-        ("atrous", "ops/_edges.py", "difference.detach() / HIGHEST_QUOTIENT", "difference / HIGHEST_QUOTIENT"),
+        ("atrous", "ops/atrous.py", "torch.sqrt(blurred(noise)", "torch.sqrt(blurred(noise.detach())"),
         # Range and precision.
         (
             "clamp_fireflies",

@@ -264,7 +264,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     lost = rounded.get("result", 0.0)
     leaves, tiny = [leaf.double() for leaf in trial.leaves], torch.finfo(trial.inner).tiny
     values = {name: value for name, value in inputs.items() if name in trial.numbers}
-    values |= {name: value for name, value in rounded.items() if name in values}  # type: ignore[misc]
+    values |= {name: value for name, value in rounded.items() if name in values}
     magnitudes = _leaves(map_tensors(lambda tensor: tensor.abs() + tiny, values))
     conditions = _conditions(trial.run, leaves, magnitudes, trial.inner, at_once=trial.op.batched)
     return [
@@ -284,7 +284,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
         changes = spread(trial.gradients, exact, trial.dtype, _DRAWS, _ALLOWED)
         rounded = trial.op.rounds(map_tensors(Tensor.double, trial.inputs), trial.case.settings)
         terms = map_tensors(torch.zeros_like, trial.numbers)
-        terms |= {name: rounded[key] for name in terms if (key := f"gradient of {name}") in rounded}  # type: ignore[misc]
+        terms |= {name: rounded[key] for name in terms if (key := f"gradient of {name}") in rounded}
         largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
         conditions = [
             (change / unit / _DEPTH + largest * term, torch.zeros_like(change))
