@@ -197,10 +197,9 @@ def test_no_text_is_too_much(results: Results, tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize("command", [["report"], ["models", "--results"]], ids=lambda words: words[0])
-@pytest.mark.parametrize("what", ["pipe", "device", "folder", "link to nothing", "large"])
+@pytest.mark.parametrize("what", ["pipe", "device", "folder", "large"])
 def test_paths_that_are_no_files_are_refused_at_once(
-    what: str, command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "results.json"
     if what == "pipe":
@@ -211,10 +210,10 @@ def test_paths_that_are_no_files_are_refused_at_once(
         path.touch()
         os.truncate(path, 1 << 40)
     else:
-        path.symlink_to("/dev/zero" if what == "device" else "nothing")
+        path.symlink_to("/dev/zero")
     with pytest.raises(SystemExit) as stop:
-        main([*command, str(tmp_path)])
+        main(["benchmark", "-o", str(tmp_path)])
     assert stop.value.code == 2
     printed = capsys.readouterr().err
-    assert printed.startswith(f"mcdenoise {command[0]}: {path}: expected the results of `mcdenoise benchmark`, found")
+    assert printed.startswith(f"mcdenoise benchmark: {path}: expected the results of `mcdenoise benchmark`, found")
     assert printed.count("\n") == 1

@@ -6,7 +6,6 @@ What is expected follows from the equations of the format, in float64.
 from __future__ import annotations
 
 import json
-import pickle
 import tracemalloc
 import warnings
 import zipfile
@@ -339,14 +338,8 @@ def test_a_member_that_is_larger_than_it_says(tmp_path: Path, name: str, method:
     assert most < 2**24
 
 
-class Pickled:
-    """Unpickling it creates a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Path.touch, (self.path,)
+# Protocol 0 of a call of os.mkdir, written out, since no code here imports the module that makes and reads such bytes.
+UNPICKLED = "cos\nmkdir\n(V{path}\ntR."
 
 
 @pytest.mark.parametrize("name", ["normal", "stranger"])
@@ -358,7 +351,7 @@ def test_nothing_is_unpickled_and_nothing_is_written_elsewhere(
     path = write(tmp_path / "frame0.zip", arrays(0))
     (about,) = described(path, "normal", dtype=dtype, filters=None, compressor=None).values()
     about = json.loads(about) | {codec: [{"id": "pickle"}] if codec == "filters" else {"id": "pickle"}}
-    content = pickle.dumps(Pickled(tmp_path / "unpickled"))
+    content = UNPICKLED.format(path=tmp_path / "unpickled").encode()
     hostile = changed(path, tmp_path / "hostile0.zip", {f"{name}/.zarray": None})
     with zipfile.ZipFile(hostile, "a") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
