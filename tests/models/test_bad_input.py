@@ -55,7 +55,8 @@ def shape_of(state: Any) -> Any:
     return type(state), [(name, shape_of(part)) for name, part in parts]
 
 
-KEEPING = [name for name in MODELS if state_of(name) is not None]
+# Named, since to run every method while tests are collected would take a minute.
+KEEPING = [name for name in MODELS if name not in ("noisy", "oidn", "oidn_open")]
 DEMANDING = [name for name in MODELS if model_of(name).needs.buffers != {"color"}]
 
 
@@ -278,5 +279,5 @@ def test_a_network_without_weights_says_which_have_them() -> None:
 
 
 def test_states_are_of_tensors_that_these_tests_look_at() -> None:
-    assert {"rae", "anf", "svgf", "bmfr", "nppd", "kp", "cascaded_v2"} <= set(KEEPING)
+    assert [name for name in MODELS if state_of(name) is not None] == KEEPING
     assert all(tensors(state_of(name)) for name in KEEPING)

@@ -105,7 +105,9 @@ def test_light_where_nothing_is_means_that_nothing_is_void() -> None:
         assert torch.equal(without_void(frame)[0].color, color)
 
 
-@pytest.mark.parametrize("model", ["joint_bilateral", "guided", blur])
+@pytest.mark.parametrize(
+    "model", ["joint_bilateral", "guided", blur], ids=lambda model: getattr(model, "__name__", model)
+)
 def test_color_and_alpha_are_one_pair(model: object) -> None:
     rows, columns = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     cover = (18.5 - ((rows - 24) ** 2 + (columns - 30) ** 2).sqrt()).div(2).clamp(0, 1)[None, None]
@@ -137,7 +139,7 @@ def covers(kind: str) -> Tensor:
 MODELS = ["joint_bilateral", "cascaded_v2_micro", blur]
 
 
-@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: getattr(model, "__name__", model))
 @pytest.mark.parametrize("kind", ["disc", "motion", "focus", "strands", "glass"])
 def test_alpha_without_noise_stays(kind: str, model: object) -> None:
     """Whatever the noise of the color."""
@@ -150,7 +152,7 @@ def test_alpha_without_noise_stays(kind: str, model: object) -> None:
 
 @pytest.mark.parametrize(("kind", "left"), [("motion", 0.7), ("focus", 0.6), ("glass", 0.7), ("strands", 1.05)])
 @pytest.mark.parametrize("samples", [4, 16])
-@pytest.mark.parametrize("model", MODELS, ids=str)
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: getattr(model, "__name__", model))
 def test_noise_of_alpha_falls_and_light_stays_its_pair(model: object, samples: int, kind: str, left: float) -> None:
     true = covers(kind)
     drawn = torch.rand(samples, *true.shape, generator=torch.Generator().manual_seed(samples))
