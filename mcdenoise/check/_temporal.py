@@ -351,7 +351,8 @@ def _histories(function: Any) -> tuple[Case, ...]:
 LAG = Op(history_lag, _LAGS, HistoryLag)
 GRADIENT = Op(temporal_gradient, _gradients(), TemporalGradient, rounds=_gradient_rounds)
 HISTORY = (
-    Op(motion_from_position, _MOTIONS, least_dtype=torch.float32, rounds=motion_rounds),
+    # Behind the camera, motion is infinite.
+    Op(motion_from_position, _MOTIONS, least_dtype=torch.float32, rounds=motion_rounds, finite=False),
     Op(reproject, _histories(reproject), images=("previous",), rounds=motion_rounds),
     Op(resample, _RESAMPLED, images=("previous",), rounds=_resample_rounds),
     Op(accumulate, _histories(accumulate), Accumulate, images=("color", "previous"), rounds=motion_rounds),

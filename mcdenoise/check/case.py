@@ -67,6 +67,7 @@ class Op:
             ``"result"`` one that is rounded in addition to the result; and as ``"gradient of NAME"`` terms that cancel.
             Ops are assumed to be backward stable, so that only those whose intermediate values are larger than their
             inputs need it.
+        finite: whether results are finite where all inputs are.
         half_precision: whether the op supports inputs in half precision.
         batched: whether the first axis of all tensors is the batch, and the op treats its images identically and
             independently, so that many inputs can be checked at once.
@@ -81,6 +82,7 @@ class Op:
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounds: Callable[[Any, dict[str, Any]], Mapping[str, Any]] = lambda inputs, settings: {}
+    finite: bool = True
     half_precision: bool = True
     batched: bool = True
     own: bool = False

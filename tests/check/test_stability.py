@@ -43,7 +43,12 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
 
 
 # bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes and cases.
-@pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
+@pytest.mark.parametrize(
+    "op",
+    # Those with 25 or more taps at each of many cases take half a minute.
+    [pytest.param(op, marks=[pytest.mark.slow] if op.name in ("atrous", "moments_variance") else []) for op in OPS],
+    ids=lambda op: op.name,
+)
 def test_every_op_is_stable(op: Op) -> None:
     checks = list(check_op(op, (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
@@ -71,7 +76,7 @@ def test_a_softmax_that_overflows_fails() -> None:
     op = BY_NAME["cross_bilateral_weights"]
 
     def naive(
-        kernel: Tensor, guides: Any, falloffs: Any, distance_falloff: Any, *, normalize: str, border: str
+        kernel: Tensor, guides: Any, falloffs: Any, distance_falloff: Any, *, border: Any = "replicate", **_: Any
     ) -> Tensor:
         one = torch.ones_like(kernel)
         falloff = op.function(one, guides, falloffs, distance_falloff, normalize="none", border=border)
@@ -93,17 +98,15 @@ def test_a_nan_gradient_fails() -> None:
     assert {"albedo 0"} <= found["gradient"]
 
 
-def test_a_result_that_does_not_scale_or_is_not_constant_fails() -> None:
+def test_a_result_that_does_not_scale_fails() -> None:
     def shifted(image: Tensor) -> Tensor:
         return BY_NAME["downsample"].function(image) + 1e-6
 
-    found = failures(like("downsample", shifted))
-    assert {"constant", "exposure", "forward"} <= found.keys()
-    assert "gradient" not in found
+    assert failures(like("downsample", shifted)).keys() == {"exposure"}
 
 
 def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = like("kernel_splat", lambda image, kernel, *, border: kernel_conv(image, kernel, border=border))
+    wrong = like("kernel_splat", lambda image, kernel, **given: kernel_conv(image, kernel, **given))
     others = tuple(op for op in OPS if op.name != "kernel_splat")
     monkeypatch.setattr(op_checks, "OPS", (*others, wrong))
     assert failures(BY_NAME["kernel_conv"]).keys() == {"adjoint"}
@@ -112,7 +115,8 @@ def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("scale", [1 + 1e-5, 1 - 1e-5])
 def test_an_error_of_a_hundred_rounding_errors_fails(scale: float) -> None:
     def scaled(image: Tensor, albedo: Tensor) -> Tensor:
-        return BY_NAME["remodulate"].function(image, albedo) * scale
+        result: Tensor = BY_NAME["remodulate"].function(image, albedo)
+        return result if result.dtype == torch.float64 else result * scale
 
     ordinary = tuple(case for case in BY_NAME["remodulate"].cases if case.kind == "ordinary" and not case.settings)
     assert failures(like("remodulate", scaled, cases=ordinary))["forward"] == {case.name for case in ordinary}
@@ -226,7 +230,6 @@ def test_the_checks_by_default_and_by_name() -> None:
         ((["sharpen"], None), "expected .* found sharpen"),
         ((["demodulat"], None), "found no demodulat; did you mean demodulate"),
         ((None, ["resnet18"]), "model 'resnet18': expected one of"),
-        ((None, ["unet"]), "model 'unet': found no model of this name"),
     ):
         with pytest.raises(InputError, match=message):
             stability.groups(*arguments)
@@ -259,7 +262,7 @@ def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path, capsys: pyt
     status, out, _ = run(capsys, "--models", f"{path}:own", "--dtypes", "float32")
     assert status == 1
     rows = {}
-    for case in ("depth 0 in some rows", "normal 0 in some rows", "albedo 93 in some rows", "hit distance 0"):
+    for case in ("depth 0 in some rows", "normal 0 in some rows", "albedo 93 in some rows"):
         (rows[case],) = (line for line in out.splitlines() if f" {case} " in line)
     assert [case for case, row in rows.items() if "FAILED" in row] == ["normal 0 in some rows"]
 

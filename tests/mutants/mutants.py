@@ -113,7 +113,7 @@ MUTANTS = tuple(
             "first, second = mean.to(moments.dtype).to(mean.dtype).split(1, 1)",
         ),
         # Models.
-        (_MODEL, "nn/inputs.py", "torch.where(lit, key / typical, 1)", "(key / typical)"),
+        (_MODEL, "nn/inputs.py", "blocks / torch.where(lit, mean, 1)", "blocks / mean"),
         (_MODEL, "nn/inputs.py", ".clamp_min(1e-3)\n", "\n"),
         (
             _MODEL,

@@ -31,7 +31,7 @@ def commands(target: str) -> dict[str, list[str]]:
     return {
         "tests": [*python, *tests, "-k", f"{target} and not compiles and not gradcheck"],
         "gradcheck": [*python, "mcdenoise", "gradcheck", target],
-        "stability": [*python, "mcdenoise", "stability", target, "--dtypes", "float32"],
+        "stability": [*python, "mcdenoise", "stability", target, "--dtypes", "float32", "float16"],
     }
 
 
