@@ -95,12 +95,6 @@ MUTANTS = tuple(
         ("accumulate", "ops/temporal.py", "base.long(), q - base", "base.long(), (q - base).detach()"),
         ("atrous", "ops/atrous.py", "torch.sqrt(blurred(noise)", "torch.sqrt(blurred(noise.detach())"),
         # Range and precision.
-        (
-            "clamp_fireflies",
-            "ops/fireflies.py",
-            "source / torch.where(bright, brightness, 1) * highest",
-            "source * highest / torch.where(bright, brightness, 1)",
-        ),
         (_LAG, "ops/lag.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
         ("temporal_gradient", "ops/gradients.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
         ("softmax_splat", "ops/softmax_splat.py", "exponents - arriving.reshape(exponents.shape)", "exponents"),
@@ -113,13 +107,8 @@ MUTANTS = tuple(
             "first, second = mean.to(moments.dtype).to(mean.dtype).split(1, 1)",
         ),
         # Models.
+        (_MODEL, "nn/inputs.py", "torch.where(lit, key / typical, 1)", "torch.where(lit, key, 1)"),
         (_MODEL, "nn/inputs.py", "blocks / torch.where(lit, mean, 1)", "blocks / mean"),
-        (_MODEL, "nn/inputs.py", ".clamp_min(1e-3)\n", "\n"),
-        (
-            _MODEL,
-            "ops/_steps/network.py",
-            "torch.where(torch.isfinite(depth), in_units / (in_units + typical), 1)",
-            "(depth / near / (depth / near + typical))",
-        ),
+        (_MODEL, "ops/_steps/network.py", "torch.log1p(current * exposure)", "torch.log1p(current)"),
     )
 )
