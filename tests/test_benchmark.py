@@ -612,16 +612,13 @@ def test_the_default_methods() -> None:
 
 
 def test_all_means_every_model() -> None:
-    """Models without weights are listed as missing, in one line."""
+    """Those without weights, if there are any, are listed as missing."""
     methods = choose_methods("all", precisions="float32")
     assert {method.model for method in methods} == set(list_models())
     assert len({method.name for method in methods}) == len(methods)
     without = set(list_models()) - set(pretrained_models()) - set(compared_models())
     untrained = {name for name in without if create_model(name).needs.trainable}
     assert {method.name for method in methods if method.missing} == untrained
-    reasons = {method.missing for method in methods if method.missing}
-    assert len(reasons) == 1
-    assert reasons.pop().startswith("expected shipped weights, found them only for: cascaded_v2")
     default = [method.name for method in choose_methods(precisions="float32")]
     assert [method.name for method in methods if method.name in default] == default
 
@@ -852,8 +849,6 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     ops = [replace(each, cases=(largest_case(each),)) for each in OPS if each.name in names]
     results = benchmark_ops(size=(33, 20), rounds=3, out=out, ops=ops)
     limits = {"float32": 2e-6, "bfloat16": 2e-2, "float16": 3e-3}
-    # Its fast backend has no derivatives.
-    forward = ("downsample",)
     by_name = {(cost.op, cost.dtype): cost for cost in results.costs if cost.backend == "torch"}
     assert list(by_name) == [(op.name, dtype) for op in ops for dtype in limits]
     # Another backend may not run here.
@@ -863,7 +858,7 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
         assert cost.milliseconds.count == 3
         assert cost.copy == pytest.approx(cost.mebibytes * 2**20 / (results.bandwidth * 1e9) * 1e3)
         assert cost.over_copy == pytest.approx(cost.milliseconds.median / cost.copy)
-        if cost.backend == "numba" and cost.op in forward:
+        if cost.backend == "numba":
             assert cost.with_derivatives is cost.over_copy_with_derivatives is None
         else:
             assert cost.with_derivatives.count == 3
@@ -875,9 +870,9 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
     assert by_name["kernel_conv", "float16"].mebibytes == (25 + 3 + 3) * 33 * 20 * 2 / 2**20
     # Derivatives read the kernel and both images again, and write the derivatives of kernel and image.
     assert by_name["kernel_conv", "float32"].mebibytes_with_derivatives == (31 + 31 + 28) * 33 * 20 * 4 / 2**20
-    # Downsampling keeps a quarter of the pixels of five channels.
-    assert by_name["downsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
-    assert by_name["upsample", "float32"].mebibytes == 5 * (33 * 20 + 17 * 10) * 4 / 2**20
+    # Downsampling keeps a quarter of the pixels of three channels.
+    assert by_name["downsample", "float32"].mebibytes == 3 * (33 * 20 + 17 * 10) * 4 / 2**20
+    assert by_name["upsample", "float32"].mebibytes == 3 * (33 * 20 + 17 * 10) * 4 / 2**20
 
     stored = json.loads((out / "ops.json").read_text())
     assert (stored["width"], stored["height"], stored["bandwidth"]) == (33, 20, results.bandwidth)

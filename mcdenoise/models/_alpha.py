@@ -65,8 +65,8 @@ def without_noise(alpha: Tensor, noise: Tensor) -> Tensor:
     patch = [padded[..., y : y + height, x : x + width] / 3 for y, x in product(range(3), repeat=2)]
     variance = noise * mean * (1 - mean)
     # Noise alone makes patches differ by twice its variance, but no patch from itself.
-    logits = alpha.new_zeros(1, _SIDE**2, 1, 1)
-    logits[:, _SIDE**2 // 2] = -1 / _FALLOFF**2
+    others = _SIDE**2 // 2
+    logits = F.pad(alpha.new_full((1, 1, 1, 1), -1 / _FALLOFF**2), (0, 0, 0, 0, others, others))
     falloff = 1 / (2 * _FALLOFF**2 * variance + 1e-8)
     kernel = logits.expand(len(alpha), -1, height, width)
     smooth = cross_bilateral_filter(alpha, kernel, [torch.cat(patch, 1)], [falloff], border="renormalize")

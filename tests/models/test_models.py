@@ -58,7 +58,7 @@ TRAINABLE = [name for name in MODELS if trainable(name)]
 
 def tensors(tree: Any) -> list[Tensor]:
     """The tensors of a state."""
-    return [leaf for leaf in pytree.tree_leaves(tree) if leaf is not None]
+    return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
 # The contract of a step

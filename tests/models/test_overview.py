@@ -45,7 +45,7 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     archive_of_library.cache_clear()
-    models(json=tmp_path / "models.json")
+    models(all=True, json=tmp_path / "models.json")
     absent = [entry for entry in json.loads((tmp_path / "models.json").read_text()) if entry["reason"]]
     assert [(entry["name"], entry["kind"]) for entry in absent] == [
         (name, "peer") for name in ("oidn", "oidn_open", "oidn_temporal")
