@@ -99,7 +99,9 @@ class Times:
         return span
 
     def _end(self) -> None:
-        self._open.pop().end = self._watch.mark()
+        # If another hook fails before the stage begins, this is called all the same.
+        if self._open:
+            self._open.pop().end = self._watch.mark()
 
 
 def _stages(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
