@@ -108,7 +108,6 @@ MUTANTS = tuple(
         ),
         # Models.
         (_MODEL, "nn/inputs.py", "torch.where(lit, key / typical, 1)", "torch.where(lit, key, 1)"),
-        (_MODEL, "nn/inputs.py", "blocks / torch.where(lit, mean, 1)", "blocks / mean"),
         (_MODEL, "ops/_steps/network.py", "torch.log1p(current * exposure)", "torch.log1p(current)"),
     )
 )
