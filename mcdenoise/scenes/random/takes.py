@@ -52,7 +52,6 @@ class Take:
 def random_takes(
     seed: int,
     frames: int,
-    zoom: float = 1.0,
     *,
     sampling: Sampling = "centre",
     spp: int | None = 1,
@@ -65,7 +64,6 @@ def random_takes(
     Args:
         seed: seed of the scene, 0 or more.
         frames: number of frames of a clip.
-        zoom: see :func:`mcdenoise.scenes.random.random_scene`.
         sampling: at the pixel centre, through a filter, or mixed: a third at the centre and the rest filtered.
         spp: samples per pixel of the noisy color; ``None`` draws them, from 1 (half of the takes) to 64 (rarely).
         stills: fraction of the seeds with stills.
@@ -78,11 +76,11 @@ def random_takes(
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAM,)))
     if rng.random() >= stills:
-        made = random_scene(seed, frames, zoom, shiny=shiny)
+        made = random_scene(seed, frames, shiny=shiny)
         return [_take(f"random{seed:04d}", made, rng, sampling, spp, width)]
     takes = []
     for view in range(max(1, frames // 2)):
-        made = random_scene(seed, 1, zoom, shiny=shiny, view=view)
+        made = random_scene(seed, 1, shiny=shiny, view=view)
         still = RandomScene(made.scene, made.cameras, focus=made.focus)
         take = _take(f"random{seed:04d}_{view}", still, rng, sampling, spp, width)
         takes.append(replace(take, view=view))
