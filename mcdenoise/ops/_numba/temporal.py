@@ -236,10 +236,10 @@ def _find_taps(
     for tap in range(4 if moves else 1):
         weight, place = weights[tap, : total.size], places[tap, : total.size]
         if normal.shape[1]:
-            _reject_turned(weight, place, normal, normal_before, limits[1], bmfr, b, start)
+            _reject_apart(weight, place, normal, normal_before, limits[1], bmfr, b, start)
         if bmfr:
             if position.shape[1]:
-                _reject_moved(weight, place, position, position_before, limits[0], b, start)
+                _reject_apart(weight, place, position, position_before, limits[0], bmfr, b, start)
         elif depth.shape[1]:
             points = (position, position_before, normal)
             _reject_distant(weight, place, depth, depth_before, *points, limits[0], b, start)
@@ -249,28 +249,17 @@ def _find_taps(
 
 
 @compiled
-def _reject_turned(
-    weight: Any, place: Any, normal: Any, before: Any, limit: Any, strict: bool, b: int, start: int
+def _reject_apart(
+    weight: Any, place: Any, vector: Any, before: Any, limit: Any, strict: bool, b: int, start: int
 ) -> None:
-    zero = weight.dtype.type(0)
-    for i in range(weight.size):
-        turn = zero
-        for c in range(3):
-            difference = before[b, c, place[i]] - normal[b, c, start + i]
-            turn += difference * difference
-        if not (turn < limit or (turn == limit and not strict)):
-            weight[i] = zero
-
-
-@compiled
-def _reject_moved(weight: Any, place: Any, position: Any, before: Any, limit: Any, b: int, start: int) -> None:
+    """Reject taps whose normals or positions are too far apart: NaN is."""
     zero = weight.dtype.type(0)
     for i in range(weight.size):
         squares = zero
         for c in range(3):
-            difference = before[b, c, place[i]] - position[b, c, start + i]
+            difference = before[b, c, place[i]] - vector[b, c, start + i]
             squares += difference * difference
-        if not squares < limit:
+        if not (squares < limit or (squares == limit and not strict)):
             weight[i] = zero
 
 
