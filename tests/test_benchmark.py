@@ -721,6 +721,16 @@ def two_frames() -> list[Frame]:
     return [synthetic_frame(24, 20)] * 2
 
 
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted as Linux lists them")
+def test_what_the_fork_server_imports_computes_nothing() -> None:
+    """The threads of OpenMP would be missing in the processes that it forks, which then wait for them."""
+    count = "len(os.listdir('/proc/self/task'))"
+    code = f"import os, torch, numpy; before = {count}; import mcdenoise.benchmark.run; print({count} - before)"
+    environment = os.environ | {"OMP_NUM_THREADS": "4"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout == "0\n"
+
+
 @pytest.mark.usefixtures("measures_memory")
 def test_peak_memory_is_that_of_the_method() -> None:
     peak = peak_memory(Greedy, two_frames, threads=1, device="cpu")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -27,15 +28,25 @@ class Case:
         kind: ``"ordinary"``, ``"stiff"`` (results change fast with the inputs) or ``"extreme"`` (at the limits of valid
             input).
         tensors: draws the tensor arguments by name, in float64.
-        differentiable: the tensor arguments in which the op is differentiable at these inputs.
+        smooth: the tensor arguments in which the op is differentiable at these inputs; by default all.
         settings: the other arguments, which the Module twin stores.
     """
 
     name: str
     kind: Kind
     tensors: Callable[[Generator], Inputs]
-    differentiable: tuple[str, ...]
+    smooth: tuple[str, ...] | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def differentiable(self) -> tuple[str, ...]:
+        """The names of :attr:`smooth`, or those of all tensors."""
+        if self.smooth is not None:
+            return self.smooth
+        drawn = self.tensors(torch.Generator().manual_seed(0))
+        return tuple(
+            key for key, value in drawn.items() if isinstance(value, Tensor) or (value and type(value) is list)
+        )
 
     def inputs(self, dtype: torch.dtype = torch.float64, seed: int = 0) -> Inputs:
         """The tensor arguments: the same numbers for the same seed, in any dtype.

@@ -162,10 +162,4 @@ def _case(function: Callable[..., Any], build: Builder, row: Row) -> Case:
     if unknown := row.given.keys() - settings.keys() - knobs.keys():
         raise TypeError(f"{function.__name__}, {row.name}: neither the op nor its builder takes {sorted(unknown)}")
     draw = partial(build, size=row.size, image=row.image, **knobs)
-    smooth = row.smooth
-    if smooth is None:
-        drawn = draw(Generator().manual_seed(0))
-        smooth = tuple(
-            key for key, value in drawn.items() if isinstance(value, Tensor) or (value and type(value) is list)
-        )
-    return Case(row.name, row.kind, draw, smooth, settings)
+    return Case(row.name, row.kind, draw, row.smooth, settings)
