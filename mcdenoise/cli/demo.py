@@ -16,9 +16,9 @@ from mcdenoise.models import DEFAULT
 
 
 def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
-    """Render 16 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
+    """Render 12 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
-    Then compare the error and the run time of a dozen models, filters and installed denoisers in a report.
+    Then compare the error and the run time of several models, filters and installed denoisers in a report.
 
     Args:
         out: folder to write to; frames that an earlier run rendered there are reused.
