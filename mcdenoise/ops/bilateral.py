@@ -142,7 +142,9 @@ def _exponent(
     # Infinite logits are finite here, so that the weight of each of two of them is not NaN, but half.
     largest = torch.finfo(dtype).max
     centres = [guide.to(dtype) for guide in guides]
+    # Once, so that their gradients are summed in that dtype, too.
     scales = [falloff.to(dtype) for falloff in falloffs]
+    spacing = None if distance_falloff is None else distance_falloff.to(dtype)
     moved = [taps(centre, kernel_size, border) for centre in centres]
     distances = []
     for _, dy, dx in offsets(kernel_size):
@@ -152,8 +154,8 @@ def _exponent(
         if (dy, dx) != (0, 0):
             for scale, tap, centre in zip(scales, seen, centres, strict=True):
                 distance = distance + scale * squared_distance(tap, centre)
-            if distance_falloff is not None:
-                distance = distance + (dy * dy + dx * dx) * distance_falloff.to(dtype)
+            if spacing is not None:
+                distance = distance + (dy * dy + dx * dx) * spacing
         distances.append(distance)
     # One plane after the other, whatever the layout of the kernel: every tap is read on its own.
     logits = start.to(dtype).contiguous().clamp(-largest, largest)

@@ -65,12 +65,15 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
     kernel_size = kernel_size_of(kernel.shape[1], "kernel")
     dtype = accumulator_dtype(image.dtype)
     source = image.to(dtype)
+    if border == "renormalize":
+        # Once: the two terms of its gradient may cancel, and are too large for half precision.
+        kernel = kernel.to(accumulator_dtype(kernel.dtype))
     total = torch.zeros_like(source)
     for weight, tap in zip(kernel.split(1, 1), taps(source, kernel_size, border), strict=True):
         total = total + weight.to(dtype) * tap
     if border == "renormalize":
         # The mean of a few large values fits where their sum does not.
-        total = _renormalized(total, kernel.to(accumulator_dtype(kernel.dtype)), kernel_size)
+        total = _renormalized(total, kernel, kernel_size)
     return total.to(image.dtype)
 
 
@@ -111,7 +114,9 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
     radius = kernel_size // 2
     source = image.to(accumulator_dtype(image.dtype))
     if border == "renormalize":
-        source = _renormalized(source, kernel.to(accumulator_dtype(kernel.dtype)), kernel_size)
+        # Once: the two terms of its gradient may cancel, and are too large for half precision.
+        kernel = kernel.to(accumulator_dtype(kernel.dtype))
+        source = _renormalized(source, kernel, kernel_size)
     total = pad(torch.zeros_like(source), radius, "zeros")
     for weight, (_, dy, dx) in zip(kernel.split(1, 1), offsets(kernel_size), strict=True):
         margin = radius + dx, radius - dx, radius + dy, radius - dy
