@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.scenes.render.tracer import first_working
+from mcdenoise.scenes.render.loading import first_working
 
 TRUE, START = (0.885, 0.699, 0.667), (0.3, 0.3, 0.3)
 KEY = "white.reflectance.value"

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from mcdenoise.integrations.mitsuba import MitsubaDenoiser
-from mcdenoise.scenes.render.tracer import LLVM, first_working
+from mcdenoise.scenes.render.loading import LLVM, first_working
 
 WALLS = "white.reflectance.value"
 START = (0.3, 0.3, 0.3)

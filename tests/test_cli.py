@@ -108,7 +108,7 @@ def whole_images(folder: Path) -> list[str]:
 # Help
 
 
-LIMITS = {"commands": 13, "options": 150}
+LIMITS = {"commands": 13, "options": 146}
 
 
 def test_help_is_complete_short_and_plain(run: Callable[..., tuple[int, str, str]]) -> None:
@@ -582,11 +582,11 @@ def camera_path(tmp_path: Path) -> Path:
 def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     # The scene of the first seed has moving objects, that of the second has none.
-    command = ["generate", "-o", out, "--seeds", "3,7", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
-    command += ["--noise-seeds", "2", "--reference-spp", "2"]
+    command = ["generate", "-o", out, "--seeds", "4,6", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
+    command += ["--assets", "none", "--noise-seeds", "2", "--reference-spp", "2"]
     status, text, errors = run(*command)
     assert (status, errors) == (0, "")
-    folders = [out / "random0003", out / "random0007"]
+    folders = [out / "random0004", out / "random0006"]
     assert text.split() == [str(folder / "inputs") for folder in folders]
     for folder, moves in zip(folders, (True, False), strict=True):
         found = open_sequence(folder)
@@ -603,43 +603,19 @@ def test_generate(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
 
 
-def test_generate_wild(run: Callable[..., tuple[int, str, str]], out: Path) -> None:
-    """One clip and two stills, by their sampling; a second call does not render existing frames again."""
-    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    command = ["generate", "-o", out, "--frames", "4", "--size", "8x8", "--variant", "scalar_rgb", "--wild"]
-    command += ["--noise-seeds", "2", "--reference-spp", "1", "--sampling", "filtered", "--seeds"]
-    for stills, names in (("0", ["random0011"]), ("1", ["random0011_0", "random0011_1"])):
-        status, text, errors = run(*command, "11", "--stills", stills)
-        assert (status, errors) == (0, "")
-        assert text.split() == [str(out / name / "inputs") for name in names]
-        for name in names:
-            found = open_sequence(out / name)
-            about = json.loads((out / name / "inputs" / "camera.json").read_text())
-            assert len(found) == (1 if "_" in name else 4)
-            assert found.noisy >= {"color", "albedo", "normal", "position", "depth"}
-            assert about["film"]["filter"] in ("box", "gaussian", "tent", "mitchell")
-            assert about["reference_spp"]["0"] == 4 * about["noisy_spp"]
-            for number in found.numbers:
-                found.frame(number, noise_seed=1).validate()
-    times = {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")}
-    assert run(*command, "11", "--stills", "0")[0] == 0
-    assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
-
-
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
         ("--seeds", "3-1", "--seeds: expected numbers and ascending ranges"),
         ("--frames", "0", "--frames: expected at least 1, found 0"),
         ("--size", "0x8", "expected width and height between 1 and 16384 pixels, found 0x8"),
-        ("--stills", "1.5", "--stills: expected a fraction from 0 to 1, found 1.5"),
     ],
 )
 def test_generate_with_bad_options(
     refused: Callable[..., str], out: Path, option: str, value: str, expected: str
 ) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    message = refused("generate", "-o", out, "--variant", "scalar_rgb", option, value)
+    message = refused("generate", "-o", out, "--assets", "none", "--variant", "scalar_rgb", option, value)
     assert expected in message
     assert not out.exists()
 

@@ -5,13 +5,13 @@ The variable BLENDER_PYTHON names an interpreter with ``bpy``; without it nothin
 
 from __future__ import annotations
 
-import functools
 import importlib.util
 import json
 import math
 import os
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,25 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.cycles import Blender, CyclesSettings, draw_settings, render_cycles, translate
+from mcdenoise.scenes.assets import Assets
+from mcdenoise.scenes.assets import Mesh as Triangles
+from mcdenoise.scenes.cycles import Blender, render_cycles, translate
 from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, _View
 from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
-from mcdenoise.scenes.random import RandomScene, random_scene
 from mcdenoise.scenes.random.builder import place, rgb, rotate
+from mcdenoise.scenes.takes.draw import Take, draw_take
 
 PYTHON = os.environ.get(PYTHON_VARIABLE)
 GRAY = {"type": "diffuse", "reflectance": rgb((0.5, 0.5, 0.5))}
-CENTRE = CyclesSettings(samples=1, pixel_filter="centre", aperture=0.0, focus=(0.5, 0.5), shutter=0.0)
 CAMERA = Camera.look_at((0, 0, 4), (0, 0, 0), fov_x=40)
+
+
+def take_of(scene: dict[str, Any], cameras: list[Camera], **changed: Any) -> Take:
+    """A take of a scene, sampled at pixel centres through a pinhole."""
+    drawn = draw_take(0, Assets(Path()), frames=1, stills=False)
+    plain = replace(drawn, scene=scene, cameras=cameras, moves={}, filter="centre", aperture=0.0)
+    return replace(plain, **changed)
 
 
 def scene_of(**entries: dict[str, Any]) -> dict[str, Any]:
@@ -116,19 +124,23 @@ def test_lamps_have_fewer_triangles() -> None:
     assert counts[0] * 5 < counts[1] == counts[2]
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
-    made = random_scene(seed, 2)
-    description = translate(made.scene, made.moves, seed=seed)
+    made = draw_take(seed, Assets(Path()), frames=2, stills=False)
+    moves = made.moves.keys() - {"sky"}
+    description = translate(made.scene, moves, seed=seed)
     objects = description.content["objects"]
-    assert {each["id"] for each in objects if each["moves"]} == set(made.moves)
+    assert {each["id"] for each in objects if each["moves"]} == moves
     assert [each["index"] for each in objects] == list(range(len(objects)))
     faces = description.arrays["object0_material"]
     assert faces.max() < len(description.content["materials"])
-    seen = [n for n, e in made.scene.items() if isinstance(e, dict) and "to_world" in e and "bsdf" in e]
-    low = min(made.scene[n]["to_world"][1, 3] for n in seen if n.startswith("spare_"))
-    # The description holds nothing below the floor, which only Mitsuba needs.
-    assert description.arrays["object0_vertices"][:, 1].min() > low + 0.005
+    expected = {
+        tuple(entry["emitter"]["radiance"]["value"])
+        for entry in made.scene.values()
+        if isinstance(entry, dict) and "emitter" in entry
+    }
+    assert {tuple(m["radiance"]) for m in description.content["materials"] if "radiance" in m} == expected
+    assert (description.content["sky"] is not None) == ("sky" in made.scene)
     description.save(tmp_path)
     assert json.loads((tmp_path / "scene.json").read_text()) == description.content
     with np.load(tmp_path / "scene.npz", allow_pickle=False) as file:
@@ -136,26 +148,12 @@ def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lamps_of_random_scenes_keep_their_radiance() -> None:
-    for seed in range(20):
-        made = random_scene(seed, 1)
-        expected = {
-            tuple(e["emitter"]["radiance"]["value"])
-            for e in made.scene.values()
-            if isinstance(e, dict) and "emitter" in e and any(e["emitter"]["radiance"]["value"])
-        }
-        content = translate(made.scene).content
-        assert {tuple(m["radiance"]) for m in content["materials"] if "radiance" in m} == expected
-        sky = made.scene["sky"]["bitmap"]
-        assert (content["sky"] is not None) == bool(sky.any())
-
-
 @pytest.mark.parametrize(
     ("bsdf", "expected"),
     [
         (GRAY, {"base": [0.5] * 3, "roughness": 1.0, "specular": 0.0, "metallic": 0.0, "coat": 0.0}),
         ({"type": "twosided", "bsdf": GRAY}, {"base": [0.5] * 3, "roughness": 1.0}),
-        ({"type": "conductor", "material": "Au"}, {"base": [1.0, 0.766, 0.336], "metallic": 1.0, "roughness": 0.0}),
+        ({"type": "conductor", "material": "Au"}, {"base": [0.94, 0.78, 0.37], "metallic": 1.0, "roughness": 0.0}),
         (
             {"type": "roughconductor", "material": "none", "alpha": 0.04, "specular_reflectance": rgb((0.5, 0.25, 1))},
             {"base": [0.5, 0.25, 1.0], "metallic": 1.0, "roughness": [0.2] * 3},
@@ -219,31 +217,6 @@ def test_unknown_plugins_are_named(scene: dict[str, Any], expected: str) -> None
 def test_only_shapes_can_move() -> None:
     with pytest.raises(InputError, match="object 'lamp':"):
         translate(scene_of(ball=ball(GRAY)), ["lamp"])
-
-
-def test_settings_are_drawn_as_users_have_them() -> None:
-    count = 2000
-    drawn = [draw_settings(seed) for seed in range(count)]
-    assert drawn[:5] == [draw_settings(seed) for seed in range(5)]
-
-    def part(which: list[bool]) -> float:
-        return sum(which) / count
-
-    # Five standard deviations of the fraction among so many are 0.056 at most.
-    assert abs(part([each.samples == 1 for each in drawn]) - 0.5) < 0.056
-    assert abs(part([each.pixel_filter == "blackman_harris" for each in drawn]) - 0.5) < 0.056
-    assert abs(part([each.pixel_filter == "centre" for each in drawn]) - 0.25) < 0.056
-    assert abs(part([each.aperture > 0 for each in drawn]) - 0.2) < 0.056
-    assert 0 < part([each.shutter > 0 for each in drawn]) < 0.25
-    assert {each.samples for each in drawn} == {1, 2, 4, 8, 16, 32}
-
-
-def test_given_settings_change_no_others_that_are_drawn() -> None:
-    for seed in range(50):
-        free, fixed, still = draw_settings(seed), draw_settings(seed, samples=7), draw_settings(seed, moving=False)
-        assert fixed == CyclesSettings(7, free.pixel_filter, free.aperture, free.focus, free.shutter)
-        assert still == CyclesSettings(free.samples, free.pixel_filter, free.aperture, free.focus, 0.0)
-    assert any(draw_settings(seed, view=1) != draw_settings(seed) for seed in range(3))
 
 
 def passes(height: int, width: int) -> dict[str, Any]:
@@ -312,7 +285,7 @@ def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path, monkeypatc
     if importlib.util.find_spec("bpy") is not None:
         pytest.skip("this Python has bpy")
     with pytest.raises(InputError, match=r"bpy.*--blender-python$"):
-        generate(tmp_path, renderer="cycles", seeds="0", frames=1)
+        generate(tmp_path, renderer="cycles", seeds="0", frames=1, assets="none")
     with pytest.raises(InputError, match="nothing that runs"):
         Blender(tmp_path / "python")
     assert not any(tmp_path.iterdir())
@@ -327,9 +300,8 @@ def blender() -> Iterator[Blender]:
 
 
 def rendered(blender: Blender, folder: Path, scene: dict[str, Any], camera: Camera = CAMERA, **options: Any) -> Any:
-    made = RandomScene(scene, [camera])
-    options = {"size": (24, 16), "settings": CENTRE, "noise_seeds": 1, "reference_samples": 64, **options}
-    return open_sequence(render_cycles(made, folder, blender, **options)).frame(0)
+    options = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 64, **options}
+    return open_sequence(render_cycles(take_of(scene, [camera]), folder, blender, **options)).frame(0)
 
 
 def image(buffer: Any) -> Any:
@@ -360,8 +332,8 @@ def test_a_gray_ball_in_an_even_sky_is_as_bright_as_it_is_gray(blender: Blender,
 def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> None:
     shiny = {"type": "roughconductor", "material": "none", "alpha": 0.1}
     scene = scene_of(ball=ball(shiny), sky={"type": "constant", "radiance": 2.0}) | floor()
-    made = RandomScene(scene, [CAMERA])
-    options: dict[str, Any] = {"size": (24, 16), "settings": CENTRE, "noise_seeds": 2, "reference_samples": 0}
+    made = take_of(scene, [CAMERA])
+    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 0}
     render_cycles(made, tmp_path, blender, **options)
     before = pixels(tmp_path)
     # Buffers that are requested later are added, and the noise stays the same.
@@ -433,19 +405,39 @@ def test_textures_lie_as_in_mitsuba(blender: Blender, tmp_path: Path) -> None:
     np.testing.assert_allclose(image(frame.albedo)[inside][:, :2], (position[inside][:, :2] + 1) / 2, atol=2e-3)
 
 
+def test_models_and_normal_maps_lie_as_in_mitsuba(blender: Blender, tmp_path: Path) -> None:
+    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], np.float32)
+    uv = (corners[:, :2] + 1) / 2
+    square = Triangles(corners, np.array([(0, 1, 2), (0, 2, 3)], np.int32), uv, None)
+    rows, columns = (np.arange(16) + 0.5) / 16, (np.arange(16) + 0.5) / 16
+    picture = np.stack(np.broadcast_arrays(columns[None], rows[:, None], np.float64(0.5)), -1)
+    # One half leans to +x, the other stands upright.
+    bumps = np.full((16, 16, 3), (0.5, 0.5, 1.0))
+    bumps[:, 8:] = (0.8, 0.5, 0.9)
+    gray = {"type": "diffuse", "reflectance": bitmap(picture)}
+    wall = {"type": "mesh", "to_world": np.eye(4), "mesh": square}
+    wall["bsdf"] = {"type": "twosided", "bsdf": {"type": "normalmap", "normalmap": bitmap(bumps), "bsdf": gray}}
+    frame = rendered(blender, tmp_path, scene_of(wall=wall, sky={"type": "constant", "radiance": 1.0}))
+    position, normal = image(frame.position), image(frame.normal)
+    inside = (np.abs(position[..., :2]) < 0.9).all(-1) & np.isfinite(image(frame.depth)[..., 0])
+    # Images of models begin at the top.
+    expected = (position[inside][:, :2] * (1, -1) + 1) / 2
+    np.testing.assert_allclose(image(frame.albedo)[inside][:, :2], expected, atol=2e-3)
+    for half, x in ((position[..., 0] < -0.1, 0.0), (position[..., 0] > 0.2, 0.6)):
+        found = normal[inside & half]
+        np.testing.assert_allclose(found, np.tile((x, 0, math.sqrt(1 - x * x)), (len(found), 1)), atol=0.02)
+
+
 def pixels(folder: Path) -> dict[str, Any]:
     return {path.relative_to(folder).as_posix(): read_exr(path)[0] for path in folder.rglob("*.exr")}
 
 
-@functools.cache
-def moving_seed() -> int:
-    return next(seed for seed in range(100) if random_scene(seed, 2).moves)
-
-
 def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Path) -> None:
-    made = random_scene(moving_seed(), 2)
+    drawn = draw_take(4, Assets(Path()), frames=2, stills=False)
+    assert drawn.moves.keys() - {"sky"}
+    made = replace(drawn, filter="gaussian", aperture=0.0)
     options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 8, "seed": 5}
-    options["settings"] = CyclesSettings(2, "blackman_harris", 0.0, (0.5, 0.5), 0.0)
+    options |= {"samples": 2, "shutter": 0.0}
     seen: list[tuple[int, int]] = []
     folder = render_cycles(made, tmp_path, blender, **options, progress=lambda *each: seen.append(each))
     assert seen[0] == (0, 2 * (2 * 2 + 8))
@@ -466,7 +458,7 @@ def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Pa
     assert after.keys() == before.keys()
     for name, values in before.items():
         np.testing.assert_array_equal(after[name], values)
-    with pytest.raises(InputError, match="'seed'"):
+    with pytest.raises(InputError, match="seed 5"):
         render_cycles(made, tmp_path, blender, **{**options, "seed": 6})
 
 
@@ -475,9 +467,10 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     bar = {"type": "rectangle", "to_world": place((0, 0, 1), scale=(0.03, 2, 1)), "bsdf": GRAY}
     scene = scene_of(wall=wall, bar=bar, sky={"type": "constant", "radiance": 1.0})
     spread = []
-    for aperture in (0.0, 8.0):
-        settings = CyclesSettings(1, "centre", aperture, (0.1, 0.1), 0.0)
-        frame = rendered(blender, tmp_path / f"{aperture}", scene, settings=settings)
+    for aperture in (0.0, 1.0):
+        take = take_of(scene, [CAMERA], aperture=aperture, focus=24.0)
+        options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 0, "shutter": 0.0}
+        frame = open_sequence(render_cycles(take, tmp_path / f"{aperture}", blender, **options)).frame(0)
         near = image(frame.depth)[..., 0] < 10
         spread.append(np.unique(np.nonzero(near)[1]).size)
     # Focused on the wall behind it, the bar is seen over more columns than the one or two that it covers.
@@ -485,15 +478,14 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     cameras = [Camera.look_at((x, 0, 4), (x, 0, 0), 40) for x in (0.0, 1.0)]
     spread = []
     for shutter in (0.0, 0.5):
-        settings = CyclesSettings(1, "centre", 0.0, (0.5, 0.5), shutter)
-        options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 0, "settings": settings}
-        folder = render_cycles(RandomScene(scene, cameras), tmp_path / f"shutter{shutter}", blender, **options)
+        take = take_of(scene, cameras)
+        folder = render_cycles(take, tmp_path / f"shutter{shutter}", blender, **{**options, "shutter": shutter})
         near = image(open_sequence(folder).frame(0).depth)[..., 0] < 10
         spread.append(np.unique(np.nonzero(near)[1]).size)
     assert spread[0] <= 2 < spread[1]
 
 
-@pytest.mark.parametrize("option", ["samples", "noise_seeds", "reference_samples", "threads", "seed", "view"])
+@pytest.mark.parametrize("option", ["samples", "noise_seeds", "reference_samples", "threads", "seed"])
 def test_numbers_below_the_least_are_told(blender: Blender, tmp_path: Path, option: str) -> None:
     with pytest.raises(InputError, match=f"{option}:"):
-        render_cycles(random_scene(0, 1), tmp_path, blender, **{option: -1})
+        render_cycles(take_of(scene_of(), [CAMERA]), tmp_path, blender, **{option: -1})

@@ -69,7 +69,7 @@ def test_descent_with_and_without_the_denoiser(
 
 
 def test_derivative_of_mitsuba_is_the_same_in_the_mean(example: ModuleType) -> None:
-    from mcdenoise.scenes.render.tracer import LLVM, first_working
+    from mcdenoise.scenes.render.loading import LLVM, first_working
 
     if first_working(("llvm_ad_rgb",)) is None:
         pytest.skip(LLVM)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError
 from mcdenoise.integrations.mitsuba import MitsubaDenoiser
-from mcdenoise.scenes.render.tracer import LLVM
+from mcdenoise.scenes.render.loading import LLVM
 
 WIDTH, HEIGHT = 64, 36
 MODEL = "cascaded_v2_micro"

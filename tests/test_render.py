@@ -23,7 +23,7 @@ from mcdenoise.models import FrameReport, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
-from mcdenoise.scenes.render.tracer import LLVM, first_working
+from mcdenoise.scenes.render.loading import LLVM, first_working
 
 SHARED_SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 WIDTH, HEIGHT = 32, 18

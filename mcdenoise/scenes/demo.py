@@ -14,21 +14,8 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import (
-    box,
-    cylinder,
-    diffuse,
-    metal,
-    place,
-    plastic,
-    rectangle,
-    rotate_x,
-    rotate_y,
-    sphere,
-    textured,
-    tint,
-    varnish,
-)
+from mcdenoise.scenes.parts import box, cylinder, diffuse, metal, plastic, rectangle, sphere, textured, tint, varnish
+from mcdenoise.scenes.random.builder import place, rotate
 
 
 def demo_scene() -> dict[str, Any]:
@@ -63,12 +50,12 @@ def demo_cameras(frames: int = 16) -> list[Camera]:
 def _room() -> dict[str, Any]:
     plaster = diffuse((0.72, 0.69, 0.63))
     return {
-        "floor": rectangle((0, 0, 0.5), (3, 3.5), rotate_x(-90), varnish(_planks())),
-        "ceiling": rectangle((0, 2.7, 0.5), (3, 3.5), rotate_x(90), diffuse((0.8, 0.8, 0.78))),
+        "floor": rectangle((0, 0, 0.5), (3, 3.5), rotate("x", -90), varnish(_planks())),
+        "ceiling": rectangle((0, 2.7, 0.5), (3, 3.5), rotate("x", 90), diffuse((0.8, 0.8, 0.78))),
         "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_wallpaper())),
-        "wall_left": rectangle((-3, 1.35, 0.5), (3.5, 1.35), rotate_y(90), plaster),
-        "wall_right": rectangle((3, 1.35, 0.5), (3.5, 1.35), rotate_y(-90), diffuse((0.62, 0.16, 0.1))),
-        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate_y(180), plaster),
+        "wall_left": rectangle((-3, 1.35, 0.5), (3.5, 1.35), rotate("y", 90), plaster),
+        "wall_right": rectangle((3, 1.35, 0.5), (3.5, 1.35), rotate("y", -90), diffuse((0.62, 0.16, 0.1))),
+        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate("y", 180), plaster),
         "skirting": box((0, 0.06, -2.98), (6, 0.12, 0.04), diffuse((0.75, 0.74, 0.7))),
     }
 
@@ -76,13 +63,13 @@ def _room() -> dict[str, Any]:
 def _lights() -> dict[str, Any]:
     window = {
         "type": "rectangle",
-        "to_world": place((-2.96, 1.6, -0.9), (1.1, 0.8, 1), rotate_y(90)),
+        "to_world": place((-2.96, 1.6, -0.9), 0, (1.1, 0.8, 1), rotate("y", 90)),
         "bsdf": diffuse((0, 0, 0)),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10.5, 11.5, 13.0]}},
     }
     bulb = {
         "type": "sphere",
-        "to_world": place((2.05, 1.62, -2.2), (0.17, 0.17, 0.17)),
+        "to_world": place((2.05, 1.62, -2.2), 0, (0.17, 0.17, 0.17)),
         "bsdf": diffuse((0, 0, 0)),
         "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [21.0, 13.0, 6.5]}},
     }
@@ -130,7 +117,7 @@ def _still_life() -> dict[str, Any]:
     return {
         "rug": {
             "type": "disk",
-            "to_world": place((0.1, 0.012, -0.7), (1.5, 1.5, 1), rotate_x(-90)),
+            "to_world": place((0.1, 0.012, -0.7), 0, (1.5, 1.5, 1), rotate("x", -90)),
             "bsdf": textured(_rings()),
         },
         "plinth": box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), textured(_tiles()), turn=25),

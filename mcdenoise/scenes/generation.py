@@ -1,121 +1,106 @@
-"""Sequences to train on: which scenes are rendered, and how; a seed is a task that any machine can do."""
+"""Sequences of the places that takes show, by Mitsuba or by Cycles; a number is a task that any machine can do."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mcdenoise.data.files import write_text
+from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.cycles import Blender, render_cycles
-from mcdenoise.scenes.random.takes import CLEANER, Sampling, Take, random_takes
-from mcdenoise.scenes.render import render_sequence
+from mcdenoise.scenes.render import choose_variant, render_sequence
+from mcdenoise.scenes.takes import ATTEMPTS, first_worth
+from mcdenoise.scenes.takes.draw import Take, draw_take
+from mcdenoise.scenes.takes.tracing import TakeTracer
 
-_Progress = Callable[[int, int], None]
+# Width of the images by which it is decided what a place shows, in pixels.
+_PROBED = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generation:
-    """How the sequences of all seeds are rendered.
+class SequencePlan:
+    """How sequences are rendered.
 
     Args:
         out: folder of the sequences; finished frames in it are kept.
-        rendering: arguments of :func:`mcdenoise.scenes.render.render_sequence`.
+        assets: what scenes are made of.
+        unseen: whether only from the tenth of the assets that is never trained on.
         frames: of each sequence.
-        wild: whether scenes are shiny, and samples drawn; see :func:`mcdenoise.scenes.random.takes.random_takes`.
-        sampling: see :func:`mcdenoise.scenes.random.takes.random_takes`.
-        stills: fraction of the seeds that give stills.
+        rendering: arguments of :func:`mcdenoise.scenes.render.render_sequence`.
         cycles: whether Cycles renders them, else Mitsuba.
-        cycles_spp: samples a pixel of Cycles; ``None`` draws them.
         parts: whether Cycles writes diffuse and specular light, too.
         threads: of Cycles; 0 for all processors.
     """
 
     out: Path
-    rendering: Mapping[str, Any]
+    assets: Assets
+    unseen: bool
     frames: int
-    wild: bool
-    sampling: Sampling
-    stills: float
-    cycles: bool
-    cycles_spp: int | None
-    parts: bool
-    threads: int
+    rendering: Mapping[str, Any]
+    cycles: bool = False
+    parts: bool = False
+    threads: int = 0
 
-    def render(
-        self, seed: int, blender: Blender | None = None, begin: Callable[[str], _Progress] = lambda name: _no_progress
-    ) -> Iterator[Path]:
-        """Render the sequences of a seed.
+    def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
+        """Render the sequence of a number.
 
         Args:
-            seed: of the scene.
-            blender: the process that renders, for Cycles.
-            begin: called with the name of each sequence; what it returns is called with the progress.
+            number: of the place, and seed of the noise.
+            progress: called with the finished and the total number of samples per pixel.
 
-        Yields:
-            The folder of each finished sequence.
+        Returns:
+            The folder of its files.
 
         Raises:
             InputError: see :func:`mcdenoise.scenes.render.render_sequence` and
-                :func:`mcdenoise.scenes.cycles.render_cycles`.
+                :func:`mcdenoise.scenes.cycles.render_cycles`; or Blender is missing.
         """
-        takes = random_takes(
-            seed,
-            self.frames,
-            sampling=self.sampling,
-            spp=None if self.wild else self.rendering["spp"],
-            stills=self.stills,
-            shiny=self.wild,
-            width=max(self.rendering["size"][0], 1),
-        )
-        for take in takes:
-            progress = begin(take.name)
-            if blender is None:
-                yield self._by_mitsuba(take, seed, progress)
-            else:
-                yield self._by_cycles(take, seed, blender, progress)
+        out = self.out / f"random{number:04d}"
+        if self.cycles:
+            # What a place shows is not decided, because that needs Mitsuba.
+            take = next(self._draws(number))
+            folder = self._by_cycles(take, out, progress)
+        else:
+            rendering = {**self.rendering, "variant": choose_variant(self.rendering["variant"])}
+            take, tracer, _ = first_worth(
+                self._draws(number), lambda take: TakeTracer(take, rendering["variant"], self.threads)
+            )
+            tracer.release()
+            folder = render_sequence(
+                take.scene, take.cameras, out, moves=take.moves, seed=number, progress=progress, **rendering
+            )
+        if take.credits:
+            write_text(out / "credits.txt", "\n".join((*take.credits, "")))
+        return folder
 
-    def _by_cycles(self, take: Take, seed: int, blender: Blender, progress: _Progress) -> Path:
-        return render_cycles(
-            take.made,
-            self.out / take.name,
-            blender,
-            size=self.rendering["size"],
-            seed=seed,
-            view=take.view,
-            samples=self.cycles_spp,
-            noise_seeds=self.rendering["noise_seeds"],
-            reference_samples=self.rendering["reference_spp"] if self.rendering["reference_frames"] != [] else 0,
-            parts=self.parts,
-            threads=self.threads,
-            progress=progress,
-        )
+    def _by_cycles(self, take: Take, out: Path, progress: Callable[[int, int], None] | None) -> Path:
+        rendering = self.rendering
+        with Blender() as blender:
+            return render_cycles(
+                take,
+                out,
+                blender,
+                size=rendering["size"],
+                seed=take.number,
+                samples=rendering["spp"],
+                noise_seeds=rendering["noise_seeds"],
+                reference_samples=rendering["reference_spp"] if rendering["reference_frames"] != [] else 0,
+                parts=self.parts,
+                threads=self.threads,
+                progress=progress,
+            )
 
-    def _by_mitsuba(self, take: Take, seed: int, progress: _Progress) -> Path:
-        reference_spp = max(self.rendering["reference_spp"], CLEANER * take.spp if self.wild else 0)
-        return render_sequence(
-            take.made.scene,
-            take.made.cameras,
-            self.out / take.name,
-            seed=seed,
-            moves=take.made.moves,
-            film=take.film,
-            progress=progress,
-            **{**self.rendering, "spp": take.spp, "reference_spp": reference_spp},
-        )
-
-
-def render_seed(generation: Generation, seed: int) -> list[Path]:
-    """A task: render the sequences of a seed, and name their folders.
-
-    Raises:
-        InputError: see :meth:`Generation.render`; or Blender is missing.
-    """
-    with ExitStack() as stack:
-        blender = stack.enter_context(Blender()) if generation.cycles else None
-        return list(generation.render(seed, blender))
-
-
-def _no_progress(done: int, total: int) -> None:
-    """Report nothing."""
+    def _draws(self, number: int) -> Iterator[Take]:
+        """Clips of the number's places, sampled once at pixel centres to see what they show."""
+        width, height = (max(side, 1) for side in self.rendering["size"])
+        size = (width, height) if self.cycles else (_PROBED, max(1, _PROBED * height // width))
+        for attempt in range(ATTEMPTS):
+            assets = self.assets.part(self.unseen)
+            take = draw_take(number, assets, attempt, frames=self.frames, size=size, stills=False)
+            yield (
+                take
+                if self.cycles
+                else replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
+            )

@@ -14,22 +14,9 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import (
-    Color,
-    box,
-    cylinder,
-    diffuse,
-    metal,
-    place,
-    plastic,
-    rectangle,
-    rotate_x,
-    rotate_y,
-    sphere,
-    textured,
-    tint,
-    varnish,
-)
+from mcdenoise.scenes.parts import box, cylinder, diffuse, metal, plastic, rectangle, sphere, textured, tint, varnish
+from mcdenoise.scenes.random.builder import place, rotate
+from mcdenoise.scenes.random.textures import Color
 
 _TABLE = 0.74
 _MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "Ag"}}
@@ -81,12 +68,12 @@ def parlour_moves(frames: int = 8) -> dict[str, Array]:
 
 def _room() -> dict[str, Any]:
     return {
-        "floor": rectangle((0, 0, 0.4), (3, 3.6), rotate_x(-90), varnish(_parquet(), 0.12)),
-        "ceiling": rectangle((0, 2.7, 0.4), (3, 3.6), rotate_x(90), diffuse((0.78, 0.77, 0.74))),
+        "floor": rectangle((0, 0, 0.4), (3, 3.6), rotate("x", -90), varnish(_parquet(), 0.12)),
+        "ceiling": rectangle((0, 2.7, 0.4), (3, 3.6), rotate("x", 90), diffuse((0.78, 0.77, 0.74))),
         "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_damask())),
-        "wall_left": rectangle((-3, 1.35, 0.4), (3.6, 1.35), rotate_y(90), diffuse((0.3, 0.38, 0.42))),
-        "wall_right": rectangle((3, 1.35, 0.4), (3.6, 1.35), rotate_y(-90), diffuse((0.66, 0.6, 0.5))),
-        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate_y(180), diffuse((0.7, 0.68, 0.62))),
+        "wall_left": rectangle((-3, 1.35, 0.4), (3.6, 1.35), rotate("y", 90), diffuse((0.3, 0.38, 0.42))),
+        "wall_right": rectangle((3, 1.35, 0.4), (3.6, 1.35), rotate("y", -90), diffuse((0.66, 0.6, 0.5))),
+        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate("y", 180), diffuse((0.7, 0.68, 0.62))),
         "mirror": rectangle((-1.15, 1.5, -2.95), (0.55, 0.6), np.eye(4), _MIRROR),
         "mirror_frame": box((-1.15, 1.5, -2.985), (1.22, 1.32, 0.05), metal("Au", 0.2)),
         "page": rectangle((0.42, 1.6, -2.985), (0.3, 0.4), np.eye(4), textured(_writing())),
@@ -97,7 +84,7 @@ def _lights() -> dict[str, Any]:
     """A window and a lamp behind the camera, which are reflected in mirror and table, and a visible lamp."""
     return {
         "window": {
-            **rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate_y(180), diffuse((0, 0, 0))),
+            **rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate("y", 180), diffuse((0, 0, 0))),
             "emitter": _area((13.0, 14.5, 16.5)),
         },
         "window_post": box((-2.1, 1.65, 3.93), (0.05, 1.5, 0.05), diffuse((0.7, 0.7, 0.68))),
@@ -116,7 +103,7 @@ def _table() -> dict[str, Any]:
         for i, (x, z) in enumerate(((-1.0, -0.6), (1.2, -0.6), (-1.0, -2.1), (1.2, -2.1)))
     }
     return {
-        "table_top": rectangle((0.1, _TABLE, -1.35), (1.25, 0.9), rotate_x(-90), wood),
+        "table_top": rectangle((0.1, _TABLE, -1.35), (1.25, 0.9), rotate("x", -90), wood),
         "table_side": box((0.1, _TABLE - 0.03, -1.35), (2.5, 0.055, 1.8), diffuse((0.05, 0.025, 0.015))),
         **legs,
         "bowl": sphere((-0.42, _TABLE + 0.15, -1.0), 0.15, metal("Cu", 0.12)),
@@ -127,7 +114,7 @@ def _table() -> dict[str, Any]:
         "slab": box((-0.72, _TABLE + 0.012, -0.75), (0.24, 0.024, 0.16), diffuse((0.15, 0.3, 0.24)), turn=-20),
         "letter": {
             "type": "rectangle",
-            "to_world": place((0.55, _TABLE + 0.003, -0.66), (0.13, 0.09, 1), rotate_y(-15) @ rotate_x(-90)),
+            "to_world": place((0.55, _TABLE + 0.003, -0.66), 0, (0.13, 0.09, 1), rotate("y", -15) @ rotate("x", -90)),
             "bsdf": textured(_writing()),
         },
     }
@@ -156,10 +143,14 @@ def _solid(name: str, foot: Color, height: float, radius: float, bsdf: dict[str,
     x, y, z = foot
     return {
         f"{name}_side": cylinder(foot, height, radius, bsdf),
-        f"{name}_foot": {"type": "disk", "to_world": place(foot, (radius, radius, 1), rotate_x(90)), "bsdf": bsdf},
+        f"{name}_foot": {
+            "type": "disk",
+            "to_world": place(foot, 0, (radius, radius, 1), rotate("x", 90)),
+            "bsdf": bsdf,
+        },
         f"{name}_top": {
             "type": "disk",
-            "to_world": place((x, y + height, z), (radius, radius, 1), rotate_x(-90)),
+            "to_world": place((x, y + height, z), 0, (radius, radius, 1), rotate("x", -90)),
             "bsdf": bsdf,
         },
     }

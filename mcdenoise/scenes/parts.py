@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-
-Color = tuple[float, float, float]
+from mcdenoise.scenes.random.builder import place
+from mcdenoise.scenes.random.textures import Color
 
 
 def tint(brightness: Array, color: Color) -> Array:
@@ -54,13 +53,13 @@ def metal(material: str, alpha: float) -> dict[str, Any]:
 
 def rectangle(center: Color, half_size: tuple[float, float], rotation: Array, bsdf: dict[str, Any]) -> dict[str, Any]:
     """A rectangle that faces +z before the rotation."""
-    return {"type": "rectangle", "to_world": place(center, (*half_size, 1), rotation), "bsdf": bsdf}
+    return {"type": "rectangle", "to_world": place(center, 0, (*half_size, 1), rotation), "bsdf": bsdf}
 
 
 def box(center: Color, size: Color, bsdf: dict[str, Any], turn: float = 0) -> dict[str, Any]:
     """A box, rotated about its vertical axis by ``turn`` degrees."""
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
-    return {"type": "cube", "to_world": place(center, half, rotate_y(turn)), "bsdf": bsdf}
+    return {"type": "cube", "to_world": place(center, turn, half), "bsdf": bsdf}
 
 
 def sphere(center: Color, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
@@ -72,22 +71,3 @@ def cylinder(foot: Color, height: float, radius: float, bsdf: dict[str, Any]) ->
     """The side of an upright cylinder, without caps."""
     top = [foot[0], foot[1] + height, foot[2]]
     return {"type": "cylinder", "p0": list(foot), "p1": top, "radius": radius, "bsdf": bsdf}
-
-
-def place(position: Color, scale: Color, rotation: Array | None = None) -> Array:
-    """Scale, then rotation, then translation, as a matrix for column vectors."""
-    matrix = np.diag((*scale, 1.0)) if rotation is None else rotation @ np.diag((*scale, 1.0))
-    matrix[:3, 3] = position
-    return np.asarray(matrix)
-
-
-def rotate_x(degrees: float) -> Array:
-    """Rotation about the x axis."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
-
-
-def rotate_y(degrees: float) -> Array:
-    """Rotation about the y axis, which points up."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])

@@ -17,11 +17,12 @@ from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.data.files import atomic_path, write_json
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.assets import default_folder, open_assets
 from mcdenoise.scenes.cycles import Blender
 from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
-from mcdenoise.scenes.random import random_scene
 from mcdenoise.scenes.render import Film, render_sequence
 from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.scenes.takes.draw import draw_take
 from mcdenoise.suite.rows import SHOTS, Row, Shot
 
 _SCRIPT = Path(__file__).with_name("blender_scenes.py")
@@ -141,10 +142,14 @@ def _render_mitsuba(shot: Shot, data: Path, fraction: float) -> None:
 
 
 def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, Array]]:
-    kind, _, seed = shot.scene.partition(" ")
-    if seed:
-        made = random_scene(int(seed), shot.frames, shiny=kind == "shiny")
-        return made.scene, made.cameras, made.moves
+    _, _, number = shot.scene.partition(" ")
+    if number:
+        missing: list[str] = []
+        assets = open_assets(default_folder(), missing.append)
+        if missing:
+            raise InputError(f"{shot.name}: {missing[0]}; expected all models and images, which it is made of")
+        take = draw_take(int(number), assets.part(unseen=True), frames=shot.frames, size=shot.size, stills=False)
+        return take.scene, take.cameras, take.moves
     return parlour_scene(), parlour_cameras(shot.frames), parlour_moves(shot.frames)
 
 

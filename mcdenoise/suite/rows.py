@@ -20,7 +20,7 @@ class Shot:
     Args:
         name: of the shot and of its folder.
         renderer: ``mitsuba`` or ``cycles``.
-        scene: ``parlour``, or ``room`` or ``shiny`` and the seed of a random scene, for Mitsuba; a name in
+        scene: ``parlour``, or ``take`` and the number of a take of unseen assets, for Mitsuba; a name in
             ``blender_scenes.py`` for Cycles.
         samples: samples per pixel.
         filter: reconstruction filter of the pixels.
@@ -123,7 +123,7 @@ def _curve(name: str, renderer: Renderer, scene: str, pixel_filter: Filter, refe
     ]
 
 
-# Shots in the order of rendering, the most informative first. No training data uses the seeds of these random rooms.
+# Shots in the order of rendering, the most informative first. No training data have the assets of these takes.
 SHOTS: tuple[Shot, ...] = (
     Shot("cycles-gallery-4", "cycles", "gallery", 4, "default"),
     Shot("mitsuba-parlour-centre-1", "mitsuba", "parlour", 1, "centre"),
@@ -132,9 +132,9 @@ SHOTS: tuple[Shot, ...] = (
     Shot("mitsuba-parlour-gaussian-16", "mitsuba", "parlour", 16, "gaussian"),
     Shot("cycles-gallery-1", "cycles", "gallery", 1, "default"),
     Shot("cycles-gallery-16", "cycles", "gallery", 16, "default"),
-    Shot("mitsuba-shiny-90001-box-1", "mitsuba", "shiny 90001", 1, "box"),
-    Shot("mitsuba-shiny-90002-gaussian-4", "mitsuba", "shiny 90002", 4, "gaussian", frames=1),
-    Shot("mitsuba-room-90003-box-16", "mitsuba", "room 90003", 16, "box", frames=1),
+    Shot("mitsuba-take-950004-box-1", "mitsuba", "take 950004", 1, "box"),
+    Shot("mitsuba-take-950003-gaussian-4", "mitsuba", "take 950003", 4, "gaussian", frames=1),
+    Shot("mitsuba-take-950005-box-16", "mitsuba", "take 950005", 16, "box", frames=1),
     Shot("cycles-gallery-centre-1", "cycles", "gallery", 1, "centre"),
     Shot("cycles-garden-4", "cycles", "garden", 4, "default"),
     Shot("cycles-attic-1", "cycles", "attic", 1, "default"),

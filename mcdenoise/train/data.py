@@ -89,7 +89,7 @@ class DataFolders:
             if not opened[0] and not packed[0]:
                 raise InputError(
                     "exact_features: expected a sequence with features without noise to train on, found none among "
-                    f"{len(training)}; render one with --sampling centre"
+                    f"{len(training)}; render one with mcdenoise generate"
                 )
         both = [*opened[0], *opened[1]]
         # Surfaces without albedo are glossy.

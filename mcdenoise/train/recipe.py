@@ -46,6 +46,10 @@ _NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
 _NO_PIXELS = ("workers", "threads")
 # A file names neither a program to run, nor a machine to connect to, nor a place outside of the data.
 _OF_CALLERS = {"workers", "assets"}
+# But a recipe may do without assets.
+_WITHOUT = ("assets", "none")
+# Sequences had other scenes before, which are not those of the same options now.
+_SCENES = 2
 # Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
 _FIRST_NAMES = {"noise_seeds": "realisations"}
 
@@ -75,6 +79,7 @@ class Rendering:
         """Checksum of everything that determines the rendered images."""
         # The number of processes does not change the pixels.
         options = {key: value for key, value in self.options.items() if key not in _NO_PIXELS}
+        options |= {} if options.get("takes") else {"scenes": _SCENES}
         return _digest({_FIRST_NAMES.get(key, key): value for key, value in options.items()})
 
     def make(self, data: Path, generate: Callable[[], object]) -> list[Path]:
@@ -249,7 +254,8 @@ def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) ->
     made = []
     for number, table in enumerate(tables, start=1):
         where = f"{path}: [[{name}]] {number}"
-        _check_keys(where, table, {*options, *_OWN} - _OF_CALLERS)
+        own = dict([item for item in table.items() if item != _WITHOUT]) if isinstance(table, dict) else table
+        _check_keys(where, own, {*options, *_OWN} - _OF_CALLERS)
         own = _checked(where, {key: table[key] for key in _OWN.keys() & table.keys()}, _OWN)
         name = own.get("folder", "")
         if name and not _NAME.fullmatch(name):

@@ -135,7 +135,8 @@ RENDERING = (
     "render scene/scene.xml --camera-path path.json -o rendered --size 16x12 --reference-spp 4 --variant scalar_rgb"
 )
 GENERATION = (
-    "generate -o generated --seeds 0 --frames 2 --size 16x12 --noise-seeds 1 --reference-spp 4 --variant scalar_rgb"
+    "generate -o generated --assets none --seeds 0 --frames 2 --size 16x12 --noise-seeds 1 --reference-spp 4"
+    " --variant scalar_rgb"
 )
 FILM = "film film.toml -o filmed"
 COMPARISON = "benchmark shot -o compared --models joint_bilateral --rounds 1 --sizes none --pictures 1 --threads 1"

@@ -192,7 +192,7 @@ SHADOWED = (
     [
         "-m mcdenoise inspect {shot}",
         "-m mcdenoise film film.toml -o out --workers 2",
-        "-m mcdenoise generate -o made --seeds 0 --frames 2 --size 32x32 --spp 1 --reference-spp 2 --workers 2",
+        "-m mcdenoise generate -o made --assets none --seeds 0 --frames 2 --size 32x32 --reference-spp 2 --workers 2",
     ],
     ids=["command", "workers", "spawned"],
 )

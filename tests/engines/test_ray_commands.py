@@ -62,7 +62,19 @@ def same(one: Path, other: Path) -> bool:
 
 
 def test_generate(cluster: Any, tmp_path: Path) -> None:
-    options = ["--seeds", "0-3", "--frames", "3", "--reference-spp", "64", "--noise-seeds", "1", *SMALL]
+    options = [
+        "--assets",
+        "none",
+        "--seeds",
+        "0-3",
+        "--frames",
+        "3",
+        "--reference-spp",
+        "64",
+        "--noise-seeds",
+        "1",
+        *SMALL,
+    ]
     assert not run("generate", "-o", tmp_path / "quiet", *options)
     lost = lose(cluster, tmp_path / "out", "*/inputs/color0.exr")
     assert not run("generate", "-o", tmp_path / "out", *options, "--workers", cluster[0].address)

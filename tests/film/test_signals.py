@@ -65,7 +65,7 @@ def test_a_signal_ends_a_film_with_one_line(tmp_path: Path, phase: str, number: 
 @pytest.mark.parametrize("seconds", [0.0, 3.0])
 def test_any_signal_ends_generate_with_workers(tmp_path: Path, number: signal.Signals, seconds: float) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    options = ["--seeds", "0-9", "--frames", "4", "--workers", "2", *RENDER]
+    options = ["--assets", "none", "--seeds", "0-9", "--frames", "4", "--workers", "2", *RENDER]
     process = started(OBEYING, "generate", "-o", tmp_path / "out", *options, folder=tmp_path)
     assert process.stdout is not None
     process.stdout.readline()

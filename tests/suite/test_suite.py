@@ -94,7 +94,7 @@ def test_scenes_and_named_parts_fit_together() -> None:
     for shot in SHOTS:
         if shot.renderer == "cycles":
             assert f"def {shot.scene}(frames: int)" in cycles
-        assert shot.scene in PARTS or shot.scene.partition(" ")[0] in ("room", "shiny")
+        assert shot.scene in PARTS or shot.scene.startswith("take ")
     for parts in PARTS.values():
         for left, top, right, bottom in parts.values():
             assert 0 <= left < right <= 1

@@ -54,7 +54,7 @@ def build(folder: str, settings: dict[str, Any]) -> None:
     Args:
         folder: folder of the files.
         settings: ``size``, ``threads``, ``filter_width``, ``box``; ``cameras``, ``fov_x`` and ``moves`` for every
-            frame, from one before the first to one after the last; ``aperture`` and ``focus``, ``shutter``.
+            frame, from one before the first to one after the last; ``aperture`` (radius) and ``focus``; ``shutter``.
     """
     content = json.loads((Path(folder) / "scene.json").read_text(encoding="utf-8"))
     with np.load(Path(folder) / "scene.npz", allow_pickle=False) as file:
@@ -136,24 +136,8 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     _animate(camera, poses)
     scene.frame_set(0)
     if settings["aperture"]:
-        _defocus(scene, data, poses[1], settings)
-
-
-def _defocus(scene: Any, data: Any, pose: Any, settings: dict[str, Any]) -> None:
-    """Focus on the surface at a pixel, and open the lens until infinitely far points are blurred over given pixels."""
-    extent = math.tan(math.radians(settings["fov_x"][1]) / 2)
-    width, height = settings["size"]
-    x, y = settings["focus"]
-    ray = pose[:3, :3] @ ((2 * x - 1) * extent, (1 - 2 * y) * extent * height / width, -1.0)
-    length = float(np.linalg.norm(ray))
-    graph = bpy.context.evaluated_depsgraph_get()
-    hit, place, *_ = scene.ray_cast(graph, pose[:3, 3].tolist(), (ray / length).tolist())
-    # The focus distance is along the viewing axis.
-    distance = float((np.array(place) - pose[:3, 3]) @ -pose[:3, 2]) if hit else 3.0
-    data.dof.use_dof = True
-    data.dof.focus_distance = distance
-    opening = settings["aperture"] / width * 2 * extent * distance
-    data.dof.aperture_fstop = data.lens * 1e-3 / opening
+        data.dof.use_dof, data.dof.focus_distance = True, settings["focus"]
+        data.dof.aperture_fstop = data.lens * 1e-3 / (2 * settings["aperture"])
 
 
 def _animate(thing: Any, poses: Any) -> None:
@@ -240,6 +224,7 @@ _INPUTS = {
     "coat_roughness": "Coat Roughness",
     "coat_ior": "Coat IOR",
     "alpha": "Alpha",
+    "normal": "Normal",
 }
 
 
@@ -250,19 +235,28 @@ def _principled(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any
             continue
         socket, value = node.inputs[name], entry[key]
         if "texture" in value:
-            texture = tree.nodes.new("ShaderNodeTexImage")
-            texture.image, texture.interpolation, texture.extension = images[value["texture"]], "Linear", "REPEAT"
-            scaled = tree.nodes.new("ShaderNodeMapping")
-            scaled.inputs["Scale"].default_value = (*value["scale"], 1)
-            tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["UV"], scaled.inputs["Vector"])
-            tree.links.new(scaled.outputs[0], texture.inputs["Vector"])
-            tree.links.new(texture.outputs["Color"], socket)
+            color = _texture(tree, value, images)
+            if key == "normal":
+                bumps = tree.nodes.new("ShaderNodeNormalMap")
+                tree.links.new(color, bumps.inputs["Color"])
+                color = bumps.outputs["Normal"]
+            tree.links.new(color, socket)
         elif socket.type == "RGBA":
             socket.default_value = (*value["value"], 1)
         else:
             number = value["value"]
             socket.default_value = number[0] if isinstance(number, list) else number
     return node.outputs[0]
+
+
+def _texture(tree: Any, value: dict[str, Any], images: dict[str, Any]) -> Any:
+    texture = tree.nodes.new("ShaderNodeTexImage")
+    texture.image, texture.interpolation, texture.extension = images[value["texture"]], "Linear", "REPEAT"
+    scaled = tree.nodes.new("ShaderNodeMapping")
+    scaled.inputs["Scale"].default_value = (*value["scale"], 1)
+    tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["UV"], scaled.inputs["Vector"])
+    tree.links.new(scaled.outputs[0], texture.inputs["Vector"])
+    return texture.outputs["Color"]
 
 
 def _pane(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:

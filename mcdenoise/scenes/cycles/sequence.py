@@ -1,4 +1,4 @@
-"""Rendering a random scene with Cycles to a training sequence in the BMFR layout.
+"""Rendering a take's scene with Cycles to a training sequence in the BMFR layout.
 
 Each noisy color has features from its own samples, as users' files do: anti-aliased, and noisy through glass, depth of
 field and motion blur. They equal those that :func:`mcdenoise.data.open_sequence` reads from a Blender file, except that
@@ -10,7 +10,6 @@ the filter: they are noisy only through lens and shutter, and an image of one sa
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,24 +19,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
-from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
+from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
 from mcdenoise.data.exr import Image
-from mcdenoise.data.files import write_json
 from mcdenoise.data.images import read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.layers import layers_of, read_layers
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
-from mcdenoise.reading import read_text
 from mcdenoise.scenes.cycles.process import Blender
-from mcdenoise.scenes.cycles.settings import WIDTHS, CyclesSettings, draw_settings
 from mcdenoise.scenes.cycles.translate import translate
-from mcdenoise.scenes.random import RandomScene
-from mcdenoise.scenes.random.takes import CLEANER
-from mcdenoise.scenes.render.folder import ReferenceState, write_reference
-from mcdenoise.scenes.render.tracer import scene_digest
+from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder, describe, write_noisy, write_reference
+from mcdenoise.scenes.takes.draw import Take
 
 # Names of the passes in Blender 4.5 and, if they differ, in 5.0.
 _PASSES = {
@@ -56,56 +49,53 @@ _LIGHT = [
 # Distance of the sky relative to everything else; the reader uses the same value.
 _SKY = 1000.0
 _REFERENCE_STREAM = 1
-_CONVENTIONS: dict[str, Any] = {
-    "color_includes_albedo": True,
-    "reference_includes_albedo": True,
-    "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31, of a view but the first "
-    "with spawn_key=(view,); stream 0 for the first noisy color, 1 for the reference, 1 + noise seed for the others",
+# Minimum ratio of reference samples to noisy samples: a reference with nearly the same noise would teach nothing.
+_CLEANER = 4
+# Blender's default is Blackman-Harris over 1.5 pixels; a width of 0.01 pixels puts every sample at the pixel centre.
+_DEFAULT_FILTER = "blackman_harris"
+_WIDTHS = {_DEFAULT_FILTER: 1.5, "box": 1.0, "centre": 0.01}
+# Fraction of the clips with motion blur, the exposure time in frames, and the stream of a seed that draws it.
+_BLURRED, _SHUTTER, _STREAM = 0.15, 0.5, 0x6379636C
+_CONVENTIONS = {
+    "seeds": "numpy.random.SeedSequence((seed, frame, stream)).generate_state(1) % 2**31; stream 0 for the "
+    "first noisy color, 1 for the reference, 1 + noise seed for the others",
     "parts": "diffuse and specular, where they are there, add up to color: specular is all light that is not diffuse",
     "features": "from the samples of the color beside them: Denoising Albedo clamped to 0..1, Denoising Normal in "
     "world space, Depth, Position",
-    "conventions": {
-        "camera_matrices": "clip = [x,y,z,1] @ M (row vectors; M is the transpose of world_to_clip); "
-        "u=(clip.x/clip.w+1)/2 left to right, v=(clip.y/clip.w+1)/2 top to bottom; clip.z/clip.w in [0,1]",
-        "camera_to_world": "column vectors; camera frame +x left, +y up, +z forward (Mitsuba)",
-    },
 }
-_IDENTITY = ("scene_sha256", "renderer", "frames", "width", "height", "seed", "view", "camera_to_world", "settings")
 
 
 def render_cycles(
-    made: RandomScene,
+    take: Take,
     out: Path,
     blender: Blender,
     *,
     size: tuple[int, int] = (160, 160),
     seed: int = 0,
-    view: int = 0,
-    samples: int | None = None,
+    samples: int = 1,
     noise_seeds: int = 2,
     reference_samples: int = 128,
-    settings: CyclesSettings | None = None,
+    shutter: float | None = None,
     parts: bool = False,
     threads: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Render a random scene with Cycles on the CPU.
+    """Render the scene of a take with Cycles on the CPU, with its lens, and with its pixel filter or Blender's default.
 
     Existing frames are kept, so an interrupted run can be resumed.
 
     Args:
-        made: the scene, its cameras and its moving objects.
+        take: what is rendered.
         out: folder of the sequence; the files go to ``out/inputs``.
         blender: the rendering process.
         size: width and height in pixels.
-        seed: seed of the noise, and of the random settings.
-        view: selects other noise and settings, for another take of the same scene.
-        samples: samples per pixel of the noisy colors; random by default, see :func:`draw_settings`.
+        seed: seed of the noise, and of the shutter.
+        samples: samples per pixel of the noisy colors.
         noise_seeds: number of noise seeds, each with its own color and features. Those after the first are written to
             ``out/inputs/noise_seed{1,2,...}``.
         reference_samples: samples per pixel of the references, but at least four times as many as of the noisy colors;
             0 for no references.
-        settings: filter, lens and shutter; random by default.
+        shutter: exposure time in frames; by default 0 for stills and most clips, and a half for some.
         parts: also write the diffuse and the specular light of the noisy colors, see
             :mod:`mcdenoise.data.readers.diffuse_specular`.
         threads: number of CPU threads; all by default. The images do not depend on it.
@@ -119,23 +109,47 @@ def render_cycles(
             be written or holds a sequence with other settings.
     """
     lowest = {"noise_seeds": (noise_seeds, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
-    lowest |= {"seed": (seed, 0), "view": (view, 0), "samples": (1 if samples is None else samples, 1)}
+    lowest |= {"seed": (seed, 0), "samples": (samples, 1)}
     for name, (value, least) in lowest.items():
         if value < least:
             raise InputError(f"{name}: expected at least {least}, found {value}")
-    count = len(made.cameras)
-    chosen = settings or draw_settings(seed, view=view, samples=samples, moving=count > 1)
-    clean_samples = max(reference_samples, CLEANER * chosen.samples) if reference_samples else 0
-    moves = check_moves(made.moves, count)
+    count = len(take.cameras)
+    if shutter is None:
+        blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
+        shutter = _SHUTTER if blurred and count > 1 else 0.0
+    used = take.filter if take.filter in _WIDTHS else _DEFAULT_FILTER
+    settings = {"filter": used, "aperture": take.aperture, "focus": take.focus, "shutter": shutter}
+    clean_samples = max(reference_samples, _CLEANER * samples) if reference_samples else 0
+    # The sky stands still in Cycles.
+    moves = check_moves({name: path for name, path in take.moves.items() if name != "sky"}, count)
     # Sorted, so that Blender's index of an object identifies it.
-    movers = [name for name in made.scene if name in moves]
-    description = translate(made.scene, movers, seed=seed)
-    folder = _Folder(out / "inputs", made, size, chosen, (seed, view), blender.version)
-    last = "specular" if parts else "color"
-    noisy = [(n, k) for n in range(count) for k in reversed(range(noise_seeds)) if not folder.has(last, n, k)]
-    clean = [n for n in range(count) if clean_samples and not folder.has_reference(n)]
-    total = count * (noise_seeds * chosen.samples + clean_samples)
-    done = total - len(noisy) * chosen.samples - len(clean) * clean_samples
+    movers = [name for name in take.scene if name in moves]
+    description = translate(take.scene, movers, seed=seed)
+    scale = _extent(take)
+    described = describe(
+        take.scene,
+        take.cameras,
+        size,
+        (1e-3 * scale, 2 * _SKY * scale),
+        moves,
+        renderer=f"Blender {blender.version}, Cycles",
+        noisy_spp=samples,
+        film=dict(settings),
+        noise_seeds=noise_seeds,
+        seed=seed,
+        position_limit_squared=(0.005 * scale) ** 2,
+    )
+    folder = SequenceFolder(out, described, _CONVENTIONS)
+    # The color is written last.
+    last = {*_FEATURES, "specular" if parts else "color", "color"}
+
+    def there(number: int, noise_seed: int) -> bool:
+        return all(has_buffer(noise_seed_folder(folder.path, noise_seed), number, name, size) for name in last)
+
+    noisy = [(n, k) for n in range(count) for k in reversed(range(noise_seeds)) if not there(n, k)]
+    clean = [n for n in range(count) if clean_samples and n not in folder.references]
+    total = count * (noise_seeds * samples + clean_samples)
+    done = total - len(noisy) * samples - len(clean) * clean_samples
 
     def advance(spent: int) -> None:
         nonlocal done
@@ -148,11 +162,13 @@ def render_cycles(
         file = Path(place) / "shot.exr"
         if noisy or clean:
             description.save(Path(place))
-            blender.ask("scene", folder=place, settings=_for_blender(made, moves, movers, chosen, size, threads, parts))
+            settings |= _for_blender(take, {name: moves[name] for name in movers})
+            settings |= {"size": list(size), "threads": threads, "passes": _LIGHT if parts else []}
+            settings |= {"box": used == "box", "filter_width": _WIDTHS[used]}
+            blender.ask("scene", folder=place, settings=settings)
 
         def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
-            sequence = np.random.SeedSequence((seed, number, stream), spawn_key=(view,) if view else ())
-            noise = int(sequence.generate_state(1)[0] % 2**31)
+            noise = int(np.random.SeedSequence((seed, number, stream)).generate_state(1)[0] % 2**31)
             blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
             images = _read(file, parts)
             file.unlink()
@@ -163,109 +179,23 @@ def render_cycles(
         # number of samples so far, and the noise of a frame must not depend on previous renderings.
         for number, noise_seed in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
-            seen = _View(made.cameras[number], size, back)
-            images = shot(number, chosen.samples, 1 + noise_seed if noise_seed else 0)
-            folder.write(number, noise_seed, seen.buffers(images))
+            seen = _View(take.cameras[number], size, back)
+            images = shot(number, samples, 1 + noise_seed if noise_seed else 0)
+            buffers = {name: _tensor(image) for name, image in seen.buffers(images).items()}
+            write_noisy(folder.path, number, noise_seed, buffers)
         for number in clean:
             images = shot(number, clean_samples, _REFERENCE_STREAM)
-            buffers = _View(made.cameras[number], size, {}).buffers(images)
-            write_clean_features(folder.path, number, _tensor(buffers["albedo"]), _tensor(buffers["normal"]))
+            seen = _View(take.cameras[number], size, {})
+            buffers = {name: _tensor(image) for name, image in seen.buffers(images).items()}
+            write_clean_features(folder.path, number, buffers["albedo"], buffers["normal"])
             state = ReferenceState(clean_samples, 1, None)
-            write_reference(folder.path, number, _tensor(buffers["color"]), state)
+            write_reference(folder.path, number, buffers["color"], state)
+            folder.note_reference(number, state)
     return folder.path
 
 
 # Buffers that every frame has, as `_View` returns them.
 _FEATURES = ("albedo", "normal", "position", "depth")
-
-
-class _Folder:
-    """The folder ``inputs`` of a sequence, with its description."""
-
-    def __init__(
-        self,
-        path: Path,
-        made: RandomScene,
-        size: tuple[int, int],
-        chosen: CyclesSettings,
-        seed: tuple[int, int],
-        version: str,
-    ) -> None:
-        self.path, self.size = path, size
-        width, height = size
-        scale = _extent(made)
-        matrices = np.stack(
-            [view_projection(each, width, height, 1e-3 * scale, 2 * _SKY * scale) for each in made.cameras]
-        )
-        content: dict[str, Any] = {
-            **_CONVENTIONS,
-            "scene": "in memory",
-            "scene_sha256": scene_digest(made.scene),
-            "renderer": f"Blender {version}, Cycles",
-            "frames": len(made.cameras),
-            "width": width,
-            "height": height,
-            "fov_x_degrees": made.cameras[0].fov_x,
-            "seed": seed[0],
-            "view": seed[1],
-            "noisy_spp": chosen.samples,
-            "settings": {**vars(chosen), "focus": list(chosen.focus)},
-            "position_limit_squared": (0.005 * scale) ** 2,
-            "normal_limit_squared": 1.0,
-            "pixel_offsets": [[0.5, 0.5]] * len(made.cameras),
-            "camera_matrices": matrices.tolist(),
-            "camera_to_world": [camera.to_world.tolist() for camera in made.cameras],
-            "moves": {name: np.asarray(path).tolist() for name, path in made.moves.items()},
-        }
-        described = path / "camera.json"
-        if described.is_file():
-            self._check(described, content)
-            return
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be created ({error.strerror}); choose another output folder") from error
-        cameras = CameraMatrices(
-            matrices,
-            np.array(content["pixel_offsets"]),
-            content["position_limit_squared"],
-            content["normal_limit_squared"],
-        )
-        write_camera_matrices(path / "camera_matrices.h", cameras, _CONVENTIONS["conventions"]["camera_matrices"])
-        write_json(described, content)
-
-    def _check(self, described: Path, content: Mapping[str, Any]) -> None:
-        try:
-            before = json.loads(read_text(described))
-            # Descriptions without a view are from before there were several, and stand for the first one.
-            changed = [key for key in _IDENTITY if {"view": 0, **before}[key] != content[key]]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{described}: cannot be read, so the run cannot be resumed; choose another output folder"
-            ) from error
-        if changed:
-            raise InputError(
-                f"{described}: rendered with another '{changed[0]}'; choose another output folder, or delete this one"
-            )
-
-    def has(self, name: str, number: int, noise_seed: int) -> bool:
-        """Whether a frame has a buffer and the color of a noise seed, which is written last."""
-        place = noise_seed_folder(self.path, noise_seed)
-        return all(has_buffer(place, number, each, self.size) for each in (*_FEATURES, name, "color"))
-
-    def has_reference(self, number: int) -> bool:
-        """Whether a frame has a reference."""
-        return has_buffer(self.path, number, "reference", self.size)
-
-    def write(self, number: int, noise_seed: int, buffers: Mapping[str, Image]) -> None:
-        """Write a noisy color and its features, the color last."""
-        place = noise_seed_folder(self.path, noise_seed)
-        try:
-            place.mkdir(exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
-        for name, image in buffers.items():
-            write_buffer(place, number, name, _tensor(image))
 
 
 class _View:
@@ -315,28 +245,13 @@ def _back(move: Array, number: int) -> Array:
     return np.asarray(move[max(number - 1, 0)] @ np.linalg.inv(move[number]))
 
 
-def _for_blender(
-    made: RandomScene,
-    moves: Mapping[str, Array],
-    movers: list[str],
-    chosen: CyclesSettings,
-    size: tuple[int, int],
-    threads: int,
-    parts: bool,
-) -> dict[str, Any]:
-    fovs = [camera.fov_x for camera in made.cameras]
+def _for_blender(take: Take, moves: Mapping[str, Array]) -> dict[str, Any]:
+    """Placements from one frame before the first to one after the last."""
+    fovs = [camera.fov_x for camera in take.cameras]
     return {
-        "size": list(size),
-        "threads": threads,
-        "passes": _LIGHT if parts else [],
-        "box": chosen.pixel_filter == "box",
-        "filter_width": WIDTHS[chosen.pixel_filter],
-        "aperture": chosen.aperture,
-        "focus": list(chosen.focus),
-        "shutter": chosen.shutter,
-        "cameras": _prolonged(np.stack([camera.to_world for camera in made.cameras])).tolist(),
+        "cameras": _prolonged(np.stack([camera.to_world for camera in take.cameras])).tolist(),
         "fov_x": [fovs[0], *fovs, fovs[-1]],
-        "moves": {name: _prolonged(moves[name]).tolist() for name in movers},
+        "moves": {name: _prolonged(path).tolist() for name, path in moves.items()},
     }
 
 
@@ -369,10 +284,10 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
     return found
 
 
-def _extent(made: RandomScene) -> float:
+def _extent(take: Take) -> float:
     """Approximate extent of the scene, metres."""
-    eye = made.cameras[0].to_world[:3, 3]
-    shapes = [entry for entry in made.scene.values() if isinstance(entry, Mapping) and "to_world" in entry]
+    eye = take.cameras[0].to_world[:3, 3]
+    shapes = [entry for entry in take.scene.values() if isinstance(entry, Mapping) and "to_world" in entry]
     away = [float(np.linalg.norm(np.asarray(shape["to_world"])[:3, 3] - eye)) for shape in shapes]
     return float(np.median(away or [1.0]))
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
+from mcdenoise.scenes import assets
 
 # Lamps get few triangles, because Cycles chooses among all emitting triangles for every sample.
 _AROUND, _AROUND_A_LAMP = 64, 20
@@ -174,6 +175,20 @@ _SHAPES: dict[str, Callable[[int], Mesh]] = {
     "disk": _disk,
     "rectangle": _rectangle,
 }
+
+
+def of_triangles(mesh: assets.Mesh) -> Mesh:
+    """The triangles of a model, with texture coordinates as Mitsuba has them, whose images begin at the top."""
+    uv = np.zeros((len(mesh.vertices), 2))
+    if mesh.uv is not None:
+        uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1).astype(np.float64)
+    return Mesh(
+        mesh.vertices.astype(np.float64),
+        mesh.faces.astype(np.int64),
+        uv[mesh.faces],
+        mesh.normals is not None,
+        closed=False,
+    )
 
 
 def as_matrix(value: Any, where: str) -> Array:

@@ -16,22 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.cycles.shapes import Mesh, as_matrix, tessellate
+from mcdenoise.scenes.cycles.shapes import Mesh, as_matrix, of_triangles, tessellate
+from mcdenoise.scenes.random.materials import METALS
 
-# Reflectance of each metal at normal incidence, linear sRGB.
-_METALS = {
-    "Ag": (0.962, 0.949, 0.922),
-    "Al": (0.912, 0.914, 0.920),
-    "Au": (1.000, 0.766, 0.336),
-    "Cu": (0.955, 0.638, 0.538),
-    "Cr": (0.549, 0.556, 0.554),
-    "W": (0.504, 0.498, 0.478),
-    "none": (1.0, 1.0, 1.0),
-}
-_SHAPE_KEYS = {"type", "to_world", "bsdf", "emitter"}
+# "none" is a perfect mirror.
+_METALS = METALS | {"none": (1.0, 1.0, 1.0)}
+_SHAPE_KEYS = {"type", "to_world", "bsdf", "emitter", "mesh"}
 _PLASTIC_IOR, _GLASS_IOR = 1.49, 1.5046
-# Invisible shapes of random scenes, which speed up compilation in Mitsuba; they are not translated.
-_SPARE = "spare_"
 # Fraction of a spot light's cone with constant intensity, Mitsuba's default.
 _BEAM = 0.75
 
@@ -67,7 +58,7 @@ def translate(scene: Mapping[str, Any], movers: Collection[str] = (), *, seed: i
     """Translate a scene.
 
     Args:
-        scene: a Mitsuba dictionary as returned by :func:`mcdenoise.scenes.random.random_scene`, with arrays for
+        scene: a Mitsuba dictionary as in :class:`mcdenoise.scenes.takes.draw.Take`, with arrays for
             transforms and bitmaps.
         movers: ids of the moving shapes, which become separate objects.
         seed: decides at random whether a lacquer becomes a specular base or a coat on a diffuse one, as artists use
@@ -95,7 +86,7 @@ class _Translator:
         groups: dict[str, list[tuple[Mesh, int]]] = {"": []}
         lights = {"point": self._point, "spot": self._spot, "envmap": self._envmap, "constant": self._constant}
         for name, entry in self._scene.items():
-            if not isinstance(entry, Mapping) or name.startswith(_SPARE):
+            if not isinstance(entry, Mapping):
                 continue
             kind = entry["type"]
             if kind in lights:
@@ -113,7 +104,10 @@ class _Translator:
 
     def _shape(self, name: str, entry: Mapping[str, Any]) -> tuple[Mesh, int]:
         where = f"scene, '{name}'"
-        mesh = tessellate(entry["type"], where, shines=any(_radiance(entry, where)))
+        if entry["type"] == "mesh":
+            mesh = of_triangles(entry["mesh"])
+        else:
+            mesh = tessellate(entry["type"], where, shines=any(_radiance(entry, where)))
         if unknown := sorted(entry.keys() - _SHAPE_KEYS):
             raise InputError(f"{where}: expected {', '.join(sorted(_SHAPE_KEYS))}, found '{unknown[0]}'")
         material = self._bsdf(where, entry["bsdf"]) if "bsdf" in entry else _principled(_color((0.5, 0.5, 0.5)))
@@ -165,6 +159,9 @@ class _Translator:
 
     def _mask(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
         return {**self._bsdf(where, bsdf["bsdf"]), "alpha": self._value(where, bsdf["opacity"])}
+
+    def _normalmap(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
+        return {**self._bsdf(where, bsdf["bsdf"]), "normal": self._value(where, bsdf["normalmap"])}
 
     def _diffuse(self, where: str, bsdf: Mapping[str, Any]) -> dict[str, Any]:
         return _principled(self._value(where, bsdf.get("reflectance", 0.5)))
@@ -282,6 +279,7 @@ _BSDFS = (
     "roughdielectric",
     "thindielectric",
     "mask",
+    "normalmap",
     "twosided",
 )
 

@@ -11,14 +11,11 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh
-from mcdenoise.scenes.random.materials import Bsdf, every_kind
+from mcdenoise.scenes.random.materials import Bsdf
 from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
 
-# Every scene is filled up to this number with lights that do not emit, since it is part of a vectorised renderer's
-# program.
-_LIGHTS = 16
 # Lower and upper corner of each shape in its own space.
 _BOUNDS = {
     "cube": ((-1, -1, -1), (1, 1, 1)),
@@ -122,43 +119,9 @@ class SceneBuilder:
         return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
 
     def scene(self) -> dict[str, Any]:
-        """The Mitsuba dictionary, filled up for a vectorised renderer."""
-        return {**self.plain_scene(), **self._rest()}
-
-    def plain_scene(self) -> dict[str, Any]:
         """The Mitsuba dictionary of what is there; a shape of the type ``"mesh"`` holds its triangles."""
         sky = {} if self._sky is None else {"sky": self._sky}
         return {"type": "scene", **self._materials, **self._objects, **self._lights, **sky}
-
-    def _rest(self) -> dict[str, Any]:
-        """Tiny hidden shapes of every type and lights that do not emit, so that all scenes use the same plugins."""
-        rest: dict[str, Any] = {}
-        below = float(self.boxes()[0][:, 1].min()) - 0.01
-        x, z = (self.low[[0, 2]] + self.high[[0, 2]]) / 2
-        for number, bsdf in enumerate(every_kind()):
-            material = f"spare_material_{number}"
-            rest[material] = bsdf
-            for kind in ("cube", "sphere", "cylinder", "disk", "rectangle"):
-                matrix = place((x + 0.01 * number, below, z), scale=(0.001, 0.001, 0.001))
-                rest[f"spare_{kind}_{number}"] = {
-                    "type": kind,
-                    "to_world": matrix,
-                    "bsdf": {"type": "ref", "id": material},
-                }
-        rest["sky"] = self._sky or {"type": "envmap", "bitmap": np.zeros((4, 8, 3)), "sampling_weight": 0.0}
-        rest["spare_point"] = {"type": "point", "position": [x, below, z], "intensity": rgb((0.0, 0.0, 0.0))}
-        rest["spare_spot"] = {"type": "spot", "to_world": place((x, below, z)), "intensity": rgb((0.0, 0.0, 0.0))}
-        rest["spare_point"]["sampling_weight"] = rest["spare_spot"]["sampling_weight"] = 0.0
-        kinds = ("rectangle", "sphere", "disk", "cube", "cylinder")
-        missing = _LIGHTS - len(self.lamps) - len(self._lights)
-        for number in range(max(missing, len(kinds))):
-            rest[f"spare_lamp_{number}"] = {
-                "type": kinds[number % len(kinds)],
-                "to_world": place((x, below, z + 0.01 * (number + 1)), scale=(0.001, 0.001, 0.001)),
-                "bsdf": {"type": "ref", "id": "spare_material_0"},
-                "emitter": {"type": "area", "radiance": rgb((0.0, 0.0, 0.0)), "sampling_weight": 0.0},
-            }
-        return rest
 
 
 def rgb(color: Color) -> dict[str, Any]:

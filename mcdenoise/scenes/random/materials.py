@@ -1,8 +1,4 @@
-"""Materials of random scenes, drawn from a fixed set of types.
-
-A vectorised renderer compiles a new program for every new set of plugins. Therefore a plain colour is also a small
-bitmap, and every scene contains every type, which :mod:`mcdenoise.scenes.random.builder` ensures.
-"""
+"""Materials of random scenes; a plain color is a small bitmap, too, so that fewer programs are compiled."""
 
 from __future__ import annotations
 
@@ -14,7 +10,15 @@ from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.textures import Color, leaf_mask, random_color, texture
 
 Bsdf = dict[str, Any]
-_METALS = ("Ag", "Al", "Au", "Cu", "Cr", "W")
+# Reflectance of each metal at normal incidence, linear sRGB.
+METALS = {
+    "Ag": (0.97, 0.96, 0.91),
+    "Al": (0.91, 0.92, 0.92),
+    "Au": (0.94, 0.78, 0.37),
+    "Cu": (0.93, 0.62, 0.49),
+    "Cr": (0.55, 0.55, 0.55),
+    "W": (0.50, 0.49, 0.45),
+}
 
 
 def diffuse(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
@@ -71,25 +75,9 @@ def foliage(rng: np.random.Generator, color: Color) -> Bsdf:
     return {"type": "mask", "opacity": _bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
 
 
-def every_kind() -> list[Bsdf]:
-    """One material of each type."""
-    gray = (0.5, 0.5, 0.5)
-    rng = np.random.default_rng(0)
-    return [
-        diffuse(gray),
-        plastic(gray),
-        rough_plastic(gray, 0.2),
-        rough_metal("Al", 0.2),
-        mirror(),
-        glass(),
-        pane(),
-        foliage(rng, gray),
-    ]
-
-
 def random_metal(rng: np.random.Generator) -> Bsdf:
     """A rough metal: untinted, tinted or brushed."""
-    material, alpha = str(rng.choice(_METALS)), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
+    material, alpha = str(rng.choice(list(METALS))), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
     if rng.random() < 0.25:
         pattern = texture(rng).mean(axis=-1, keepdims=True)
         return rough_metal(material, np.clip(alpha * (0.5 + 2 * pattern), 0.02, 0.5))
@@ -117,7 +105,7 @@ def random_material(rng: np.random.Generator) -> Bsdf:
     if kind < 0.82:
         return random_metal(rng)
     if kind < 0.88:
-        return mirror(str(rng.choice(_METALS)))
+        return mirror(str(rng.choice(list(METALS))))
     return glass(float(rng.uniform(1.3, 1.75)))
 
 

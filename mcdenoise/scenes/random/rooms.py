@@ -1,16 +1,15 @@
-"""Types of random scenes: rooms lit through windows or by lamps, still lifes, colonnades, light experiments."""
+"""Rooms without furniture, procedural furniture for them, still lifes, colonnades and light experiments."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.builder import SceneBuilder, ball, box, place, rod, sheet
 from mcdenoise.scenes.random.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
-from mcdenoise.scenes.random.lights import add_lamps, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.lights import sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import (
     Bsdf,
     diffuse,
@@ -26,54 +25,6 @@ Rng = np.random.Generator
 # A room with more shapes than this gets no more furniture.
 _ENOUGH_SHAPES = 290
 _WALL = 0.25
-
-
-def build(rng: Rng) -> SceneBuilder:
-    """A random scene without its cameras."""
-    kinds: list[Callable[[Rng], SceneBuilder]] = [
-        _daylight_room,
-        _lamp_room,
-        still_life,
-        colonnade,
-        light_experiment,
-    ]
-    return kinds[int(rng.choice(len(kinds), p=[0.32, 0.26, 0.2, 0.14, 0.08]))](rng)
-
-
-def _daylight_room(rng: Rng) -> SceneBuilder:
-    """A room lit through its windows by the sky and often the sun."""
-    builder, size = empty_room(rng)
-    lit_walls = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.6, 0.3, 0.1]))]
-    opening = 0.0
-    for wall in range(4):
-        if wall in lit_walls:
-            opening += wall_with_windows(builder, rng, size, wall)
-        else:
-            closed_wall(builder, rng, size, wall)
-    surface = 2 * float(size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
-    level = float(np.clip(0.25 * surface / max(opening, 0.1), 1.5, 40)) * float(np.exp(rng.uniform(-0.7, 0.7)))
-    sun = sun_direction(rng, outwards(int(lit_walls[0]))) if rng.random() < 0.65 else None
-    builder.set_sky(sky(rng, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
-    if rng.random() < 0.25:
-        add_lamps(builder, rng, builder.low, builder.high, int(rng.integers(1, 3)), 0.1)
-    _furnish(builder, rng, size)
-    return builder
-
-
-def _lamp_room(rng: Rng) -> SceneBuilder:
-    """A room with lamps, and sometimes a window with a night or dusk sky."""
-    builder, size = empty_room(rng)
-    window = int(rng.integers(4)) if rng.random() < 0.3 else -1
-    for wall in range(4):
-        if wall == window:
-            wall_with_windows(builder, rng, size, wall)
-        else:
-            closed_wall(builder, rng, size, wall)
-    if window >= 0:
-        builder.set_sky(sky(rng, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
-    add_lamps(builder, rng, builder.low, builder.high, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
-    _furnish(builder, rng, size)
-    return builder
 
 
 def still_life(rng: Rng) -> SceneBuilder:
@@ -245,7 +196,7 @@ def closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None
 
 
 def wall_with_windows(
-    builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float = 0.5, glow: Color | None = None
+    builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float, glow: Color | None = None
 ) -> float:
     """A wall with a row of windows with bars; returns the windows' area.
 
@@ -310,8 +261,9 @@ def wall_with_windows(
     return count * wide * (top - sill) * (0.5 if dressing != "none" else 1)
 
 
-def _furnish(builder: SceneBuilder, rng: Rng, size: Array) -> None:
-    """Put furniture on the floor, in proportion to its area."""
+def furnish(builder: SceneBuilder, rng: Rng) -> None:
+    """Put procedural furniture on the floor of a room, in proportion to its area."""
+    size = builder.high - builder.low
     taken: list[tuple[float, float, float]] = []
     pieces = int(np.clip(size[0] * size[2] / rng.uniform(2.5, 6), 2, 9))
     for _ in range(pieces):

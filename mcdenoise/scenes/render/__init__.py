@@ -2,8 +2,8 @@
 
 from mcdenoise.data.camera_path import Camera, CameraPath, load_camera_path, view_projection
 from mcdenoise.scenes.render.film import FILTERS, Film
+from mcdenoise.scenes.render.loading import VARIANTS, Scene, choose_variant
 from mcdenoise.scenes.render.sequence import render_sequence
-from mcdenoise.scenes.render.tracer import VARIANTS, Scene, choose_variant
 
 __all__ = [
     "FILTERS",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,30 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.camera_path import Array, Camera, view_projection
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.files import write_json
 from mcdenoise.data.images import read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
+from mcdenoise.scenes.render.loading import Scene, scene_digest, scene_name
 
 _ADVICE = "choose another output folder, or delete this one"
-_CONVENTIONS: dict[str, Any] = {
+_ALWAYS: dict[str, Any] = {
     "color_includes_albedo": True,
     "reference_includes_albedo": True,
+    "conventions": {
+        "camera_matrices": "clip = [x,y,z,1] @ M (row vectors; M is the transpose of world_to_clip); "
+        "u=(clip.x/clip.w+1)/2 left to right, v=(clip.y/clip.w+1)/2 top to bottom; clip.z/clip.w in [0,1]",
+        "pixel": "index = (u*width - ox, v*height - (1-oy)), pixel_offsets = (ox, oy)",
+        "reprojection": "frame i uses camera_matrices[i-1]",
+        "camera_to_world": "column vectors; camera frame +x left, +y up, +z forward (Mitsuba)",
+        "moves": "for each object that moves, one world-space matrix per frame (column vectors), applied after the "
+        "transform that the scene gives it",
+    },
+}
+BY_MITSUBA: dict[str, Any] = {
     "noisy_seed": "numpy.random.SeedSequence((seed, frame, 0, pass)).generate_state(1)",
     "further_noisy_seeds": "numpy.random.SeedSequence((seed, frame, 1 + k, pass)).generate_state(1), for the colors in "
     "noise_seed{k}, k = 1, 2, ...",
@@ -39,18 +52,9 @@ _CONVENTIONS: dict[str, Any] = {
     "samples": "only where they were kept: samplesN.exr has the single paths whose mean is the noisy colour, as layers "
     "sample0, sample1, ...; on a film with the features of each",
     "previous_position": "only with moves: where the surface point seen now was in the previous frame, world space",
-    "conventions": {
-        "camera_matrices": "clip = [x,y,z,1] @ M (row vectors; M is the transpose of world_to_clip); "
-        "u=(clip.x/clip.w+1)/2 left to right, v=(clip.y/clip.w+1)/2 top to bottom; clip.z/clip.w in [0,1]",
-        "pixel": "index = (u*width - ox, v*height - (1-oy)), pixel_offsets = (ox, oy)",
-        "reprojection": "frame i uses camera_matrices[i-1]",
-        "camera_to_world": "column vectors; camera frame +x left, +y up, +z forward (Mitsuba)",
-        "moves": "for each object that moves, one world-space matrix per frame (column vectors), applied after the "
-        "transform that the scene gives it",
-    },
 }
 # Differences on a film; see :mod:`mcdenoise.scenes.render.film`.
-_ON_A_FILM: dict[str, Any] = {
+ON_A_FILM: dict[str, Any] = {
     "pixel_sampling": "jittered samples through the pixel filter and the lens of 'film'; features are means over the "
     "samples of their color, and each folder noise_seed{1,2,...} has its own",
     "albedo": "Mitsuba's aov, clamped to [0, 1]",
@@ -98,14 +102,15 @@ class SequenceFolder:
 
     Args:
         out: folder of the sequence; created if it does not exist.
-        settings: contents of ``camera.json`` besides the conventions. ``reference_spp`` and ``reference_noise`` are
-            added here, for the references on disk.
+        settings: contents of ``camera.json``, see :func:`describe`. ``reference_spp`` and ``reference_noise`` are added
+            here, for the references on disk.
+        conventions: how the renderer makes what the files hold.
 
     Raises:
         InputError: the folder cannot be created, or was rendered with other settings.
     """
 
-    def __init__(self, out: Path, settings: dict[str, Any]) -> None:
+    def __init__(self, out: Path, settings: dict[str, Any], conventions: Mapping[str, Any]) -> None:
         self.path = out / "inputs"
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -115,7 +120,7 @@ class SequenceFolder:
             ) from error
         self._description = self.path / "camera.json"
         before = self._read(settings) if self._description.is_file() else {}
-        self._settings = {**_merged(before, settings), **_CONVENTIONS, **(_ON_A_FILM if settings["film"] else {})}
+        self._settings = {**_merged(before, settings), **_ALWAYS, **conventions}
         self.references = self._find_references(before.get("reference_spp", {}))
         self._write()
         matrices = CameraMatrices(
@@ -124,7 +129,7 @@ class SequenceFolder:
             self._settings["position_limit_squared"],
             self._settings["normal_limit_squared"],
         )
-        write_camera_matrices(self.path / "camera_matrices.h", matrices, _CONVENTIONS["conventions"]["camera_matrices"])
+        write_camera_matrices(self.path / "camera_matrices.h", matrices, _ALWAYS["conventions"]["camera_matrices"])
 
     def note_reference(self, number: int, state: ReferenceState) -> None:
         """Record the progress of a reference in ``camera.json``.
@@ -146,8 +151,9 @@ class SequenceFolder:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
-            if before.get(key) != settings[key]:
-                raise InputError(f"{described}: rendered with {key} {before.get(key)}, now {settings[key]}; {_ADVICE}")
+            if before.get(key) != settings.get(key):
+                found = f"rendered with {key} {before.get(key)}, now {settings.get(key)}"
+                raise InputError(f"{described}: {found}; {_ADVICE}")
         for number, pose in enumerate(zip(*(settings[key] for key in _POSES), strict=True)):
             if number < len(poses) and pose != poses[number]:
                 raise InputError(f"{described}: frame {number} was rendered from another camera; {_ADVICE}")
@@ -187,6 +193,45 @@ class SequenceFolder:
         noise = {str(number): state.noise for number, state in states}
         content = {**self._settings, "reference_spp": spp, "reference_noise": noise}
         write_json(self._description, content)
+
+
+def describe(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    size: tuple[int, int],
+    planes: tuple[float, float],
+    moves: Mapping[str, Array],
+    **settings: Any,
+) -> dict[str, Any]:
+    """Contents of ``camera.json``: scene, cameras and moves, and the settings of a renderer.
+
+    Args:
+        scene: what is rendered.
+        cameras: one a frame.
+        size: width and height in pixels.
+        planes: distances of the near and the far plane.
+        moves: see :class:`mcdenoise.data.camera_path.CameraPath`; may be of more frames.
+        settings: further entries.
+    """
+    matrices = np.stack([view_projection(camera, *size, *planes) for camera in cameras])
+    moved = {name: path[: len(cameras)].tolist() for name, path in moves.items()}
+    return {
+        "scene": scene_name(scene),
+        "scene_sha256": scene_digest(scene),
+        "frames": len(cameras),
+        "width": size[0],
+        "height": size[1],
+        "fov_x_degrees": cameras[0].fov_x,
+        "near": planes[0],
+        "far": planes[1],
+        "normal_limit_squared": 1.0,
+        "pixel_offsets": [[0.5, 0.5]] * len(cameras),
+        "camera_matrices": matrices.tolist(),
+        "world_to_clip": matrices.transpose(0, 2, 1).tolist(),
+        "camera_to_world": [camera.to_world.tolist() for camera in cameras],
+        **({"moves": moved} if moved else {}),
+        **settings,
+    }
 
 
 def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceState) -> None:

@@ -10,25 +10,18 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays, view_projection
+from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
 from mcdenoise.engines import Engine, LocalEngine
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder
+from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder, describe
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
+from mcdenoise.scenes.render.loading import Scene, choose_variant
 from mcdenoise.scenes.render.tasks import TracerSource, render_on_engine
-from mcdenoise.scenes.render.tracer import (
-    RR_DEPTH,
-    STRATIFIED_PATHS,
-    Scene,
-    choose_variant,
-    scene_digest,
-    scene_name,
-)
+from mcdenoise.scenes.render.tracer import RR_DEPTH, STRATIFIED_PATHS
 
 _LARGEST_SIDE = 16384
 
@@ -129,37 +122,26 @@ def render_sequence(
     scale = float(np.median(np.minimum(distance, reach)))
     near, far = 0.01 * scale, 2 * reach
     cameras = cameras[:count]
-    matrices = np.stack([view_projection(camera, width, height, near, far) for camera in cameras])
-    settings: dict[str, Any] = {
-        "scene": scene_name(scene),
-        "scene_sha256": scene_digest(scene),
-        "renderer": tracer.name,
-        "frames": count,
-        "width": width,
-        "height": height,
-        "fov_x_degrees": cameras[0].fov_x,
-        "near": near,
-        "far": far,
-        "noisy_spp": spp,
-        "film": None if film is None else asdict(film),
+    settings = describe(
+        scene,
+        cameras,
+        size,
+        (near, far),
+        checked_moves,
+        renderer=tracer.name,
+        noisy_spp=spp,
+        film=None if film is None else asdict(film),
         # Omitted if unused, as in folders of versions without this setting.
-        "samples_kept": True if keep_samples else None,
-        "noise_seeds": noise_seeds,
-        "max_depth": max_depth,
-        "rr_depth": RR_DEPTH,
-        "seed": seed,
-        "reference_sampling": f"passes of {STRATIFIED_PATHS} multi-jittered paths, a smaller rest of independent ones",
-        "background": f"no hit: albedo and normal are 0, world_position is {reach:g} units along the ray",
-        "position_limit_squared": (0.02 * scale) ** 2,
-        "normal_limit_squared": 1.0,
-        "pixel_offsets": [[0.5, 0.5]] * count,
-        "camera_matrices": matrices.tolist(),
-        "world_to_clip": matrices.transpose(0, 2, 1).tolist(),
-        "camera_to_world": [camera.to_world.tolist() for camera in cameras],
-    }
-    if checked_moves:
-        settings["moves"] = {name: moved[:count].tolist() for name, moved in checked_moves.items()}
-    folder = SequenceFolder(Path(out), settings)
+        samples_kept=True if keep_samples else None,
+        noise_seeds=noise_seeds,
+        max_depth=max_depth,
+        rr_depth=RR_DEPTH,
+        seed=seed,
+        reference_sampling=f"passes of {STRATIFIED_PATHS} multi-jittered paths, a smaller rest of independent ones",
+        background=f"no hit: albedo and normal are 0, world_position is {reach:g} units along the ray",
+        position_limit_squared=(0.02 * scale) ** 2,
+    )
+    folder = SequenceFolder(Path(out), settings, BY_MITSUBA | (ON_A_FILM if film is not None else {}))
     job = FrameJob(
         folder=folder.path,
         cameras=cameras,

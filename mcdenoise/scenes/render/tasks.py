@@ -12,7 +12,8 @@ from mcdenoise.engines import Engine, Task, run_tasks
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
-from mcdenoise.scenes.render.tracer import Scene, Tracer
+from mcdenoise.scenes.render.loading import Scene
+from mcdenoise.scenes.render.tracer import Tracer
 
 # The last scene that this worker has loaded, by the folder of its frames: a folder has one scene.
 _loaded: dict[Path, Tracer] = {}

@@ -6,30 +6,17 @@ Mitsuba; :mod:`mcdenoise.scenes.render.film` uses Mitsuba's own renderer. Mitsub
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import importlib
-import os
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array, Camera, PixelRays
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.render.loading import LLVM, Scene, first_line, import_mitsuba, load_scene
 
-Scene: TypeAlias = str | Path | Mapping[str, Any]
-
-VARIANTS = ("scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
-# What a person without Mitsuba's derivatives, or its fast variant on a CPU, has to do.
-LLVM = (
-    "Mitsuba's llvm_ad_rgb needs LLVM 19 or newer (Debian: apt-get install libllvm19); set DRJIT_LIBLLVM_PATH to its "
-    "library, such as /usr/lib/x86_64-linux-gnu/libLLVM.so.19.1"
-)
 RR_DEPTH = 5
 _SEE_THROUGH_LAYERS = 8
 _WAVEFRONT = 2**20  # paths traced at once: enough to fill the vector units, small enough for a laptop's memory
@@ -81,19 +68,19 @@ class Tracer:
         *,
         merge: bool = True,
     ) -> None:
-        self.mitsuba = mi = _import_mitsuba()
+        self.mitsuba = mi = import_mitsuba()
         try:
             mi.set_variant(variant)
         except ImportError as error:
             advice = f"; {LLVM}" if variant.startswith("llvm") else ""
-            raise InputError(f"Mitsuba variant '{variant}' does not run here: {_first_line(error)}{advice}") from error
+            raise InputError(f"Mitsuba variant '{variant}' does not run here: {first_line(error)}{advice}") from error
         self._dr = importlib.import_module("drjit")
         # On a single core, parallel loading of a scene whose parts refer to each other deadlocks.
         self._dr.set_thread_count(max(2, self._dr.thread_count()))
         self._scalar = variant.startswith("scalar")
         self.name = f"mitsuba {mi.__version__} ({variant}, drjit {self._dr.__version__}), path integrator"
         # Merged meshes could not move separately.
-        self.scene = _load_scene(mi, scene, merge=merge and not moves)
+        self.scene = load_scene(mi, scene, merge=merge and not moves)
         self.path = mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": RR_DEPTH})
         self._independent = mi.load_dict({"type": "independent"})
         self._stratified = mi.load_dict({"type": "multijitter", "sample_count": STRATIFIED_PATHS})
@@ -121,7 +108,7 @@ class Tracer:
             try:
                 self._parameters.update()
             except RuntimeError as error:
-                raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {_first_line(error)}") from error
+                raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {first_line(error)}") from error
 
     def reach(self, cameras: Sequence[Camera]) -> float:
         """A distance from each camera that is behind everything in the scene: the distance of the background."""
@@ -309,134 +296,6 @@ class Tracer:
         return total / 16
 
 
-def choose_variant(variant: str | None) -> str:
-    """Choose the variant: the given one, the one that Mitsuba is set to, or the fastest that works here.
-
-    Raises:
-        InputError: Mitsuba is missing, or the variant is unknown.
-    """
-    if variant is None:
-        current = _import_mitsuba().variant()
-        variant = current if current in VARIANTS else (first_working(("cuda_ad_rgb", "llvm_ad_rgb")) or "scalar_rgb")
-    if variant not in VARIANTS:
-        raise InputError(f"Mitsuba variant: expected one of {', '.join(VARIANTS)}, found '{variant}'")
-    return variant
-
-
-@functools.cache
-def first_working(variants: tuple[str, ...]) -> str | None:
-    """The first of these variants that can render here; ``None`` if none can.
-
-    The variants are tried in a child process, because an LLVM that is too old for the processor aborts the process.
-    """
-    trial = f"""
-import mitsuba as mi
-for variant in {variants!r}:
-    try:
-        mi.set_variant(variant)
-        mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()
-    except Exception:
-        continue
-    print("works:", variant)
-    break
-"""
-    # Neither Python, with -P, nor Mitsuba then loads anything from the folder of somebody's scene.
-    command, folder = [sys.executable, "-P", "-c", trial], Path(__file__).parent
-    try:
-        child = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, cwd=folder)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    # The output may also contain other text, such as warnings of a driver.
-    found = [variant for variant in variants if f"works: {variant}" in child.stdout]
-    return found[0] if found else None
-
-
-def scene_name(scene: Scene) -> str:
-    """Name of a scene: the folder of a ``scene.xml``, the name of any other file."""
-    if isinstance(scene, Mapping):
-        return "in memory"
-    path = Path(scene).resolve()
-    return path.parent.name if path.stem == "scene" else path.stem
-
-
-def scene_digest(scene: Scene) -> str:
-    """Checksum of a scene's description; of the files that an XML refers to, only the names are included."""
-    digest = hashlib.sha256()
-
-    def feed(value: Any) -> None:
-        if isinstance(value, Mapping):
-            for key, item in value.items():
-                digest.update(f"{key}:".encode())
-                feed(item)
-        elif isinstance(value, np.ndarray):
-            digest.update(str(value.shape).encode() + value.tobytes())
-        elif isinstance(value, list | tuple):
-            digest.update(f"{len(value)}:".encode())
-            for item in value:
-                feed(item)
-        elif isinstance(value, np.generic):
-            # numpy's formatting of its scalars is a global setting, which colour-science changes.
-            feed(value.item())
-        else:
-            digest.update(f"{value!r};".encode())
-
-    feed(scene if isinstance(scene, Mapping) else Path(scene).read_bytes())
-    return digest.hexdigest()
-
-
-def _import_mitsuba() -> Any:
-    try:
-        mitsuba = importlib.import_module("mitsuba")
-    except ImportError as error:
-        raise InputError(
-            "rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'"
-        ) from error
-    places = mitsuba.file_resolver()
-    for number in reversed(range(len(places))):
-        # Mitsuba would load native code, plugins/NAME.so, from the working folder before its own.
-        if str(places[number]) == os.getcwd():
-            del places[number]
-    return mitsuba
-
-
-def _load_scene(mi: Any, scene: Scene, merge: bool) -> Any:
-    if not isinstance(scene, Mapping):
-        scene = Path(scene)
-        if not scene.is_file():
-            raise InputError(f"{scene}: expected a Mitsuba scene, found no such file; check the path")
-        scene = scene.absolute()
-        native = [each.name for each in scene.parent.glob("plugins/*") if each.suffix in (".so", ".dylib", ".dll")]
-        if native or b"<path" in scene.read_bytes():
-            found = f"plugins/{native[0]}" if native else "an element <path>, which names a folder for them"
-            raise InputError(
-                f"{scene}: expected a scene without plug-ins, which are native code that Mitsuba would run, found "
-                f"{found}; remove it"
-            )
-    try:
-        if isinstance(scene, Mapping):
-            loaded = mi.load_dict(_to_mitsuba(mi, scene), optimize=merge)
-        else:
-            loaded = mi.load_file(str(scene), optimize=merge)
-    except (RuntimeError, TypeError, ValueError) as error:
-        where = "scene dictionary" if isinstance(scene, Mapping) else scene
-        raise InputError(f"{where}: Mitsuba cannot load it: {_first_line(error)}") from error
-    if not isinstance(loaded, mi.Scene):
-        raise InputError(
-            f"expected a Mitsuba scene, found a {type(loaded).__name__}; its outermost type must be 'scene'"
-        )
-    return loaded
-
-
-def _to_mitsuba(mi: Any, value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _to_mitsuba(mi, item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        if value.shape == (4, 4):
-            return mi.ScalarTransform4f(value)
-        return mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
-    return value
-
-
 def _aligned(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """A copy at an address divisible by 64: drjit compiles the alignment of borrowed memory into the kernel."""
     room = np.empty(values.nbytes + 64, np.uint8)
@@ -470,8 +329,3 @@ def _transformed(key: str, value: Array, matrix: Array) -> tuple[Any, ...]:
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         return ((normals / np.where(length > 0, length, 1)).astype(np.float32).ravel(),)
     return ((value @ linear.T + offset).astype(np.float32).ravel(),)
-
-
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,12 +16,13 @@ from mcdenoise.data.shards import ERROR, SUFFIX, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
 from mcdenoise.scenes.assets import Assets
-from mcdenoise.scenes.takes.draw import FRAMES, REFERENCES, draw_take
+from mcdenoise.scenes.takes.draw import FRAMES, REFERENCES, Take, draw_take
 from mcdenoise.scenes.takes.tracing import HALF, TakeTracer
 
-__all__ = ["TakePlan", "render_takes"]
+__all__ = ["ATTEMPTS", "TakePlan", "first_worth"]
 
-_ATTEMPTS = 6
+Frame: TypeAlias = dict[str, Array]
+ATTEMPTS = 6
 # Largest SMAPE between two means of eight samples: with more, the references are noise, too.
 _NOISIEST = 0.65
 _MIDDLE = 0.2
@@ -59,26 +60,31 @@ class TakePlan:
         own = {"unseen": self.unseen, "assets": self.assets.digest, "frames": self.frames, "size": size}
         return {"takes": 1, **own, "reference_spp": 2 * self.half}
 
+    def render(self, number: int) -> Path:
+        """Render the take of a number, if it is not there yet.
 
-def render_takes(plan: TakePlan, numbers: Sequence[int]) -> Iterator[Path]:
-    """Render the takes of these numbers that are not there yet, one after the other.
+        Returns:
+            Its file.
 
-    Args:
-        plan: how.
-        numbers: of the takes.
-
-    Yields:
-        The file of each take.
-
-    Raises:
-        InputError: Mitsuba is missing, or the folder cannot be written or holds takes of another plan.
-    """
-    _claim(plan)
-    for number in numbers:
-        path = plan.out / f"{number:06d}{SUFFIX}"
+        Raises:
+            InputError: Mitsuba is missing, or the folder cannot be written or holds takes of another plan.
+        """
+        _claim(self)
+        path = self.out / f"{number:06d}{SUFFIX}"
         if not path.exists():
-            _render(plan, number, path)
-        yield path
+            _render(self, number, path)
+        return path
+
+
+def first_worth(draws: Iterable[Take], tracer_of: Callable[[Take], TakeTracer]) -> tuple[Take, TakeTracer, Frame]:
+    """The first draw that is worth its references, or the last one; its tracer, and its last noisy frame."""
+    for take in draws:
+        tracer, last = tracer_of(take), len(take.cameras) - 1
+        tracer.place(last)
+        final = tracer.noisy(last)
+        if _shows_enough(final, take.void) and tracer.noise(last) < _NOISIEST:
+            break
+    return take, tracer, final
 
 
 def _claim(plan: TakePlan) -> None:
@@ -99,14 +105,9 @@ def _claim(plan: TakePlan) -> None:
 
 def _render(plan: TakePlan, number: int, path: Path) -> None:
     assets = plan.assets.part(plan.unseen)
-    for attempt in range(_ATTEMPTS):
-        take = draw_take(number, assets, attempt, frames=plan.frames, size=plan.size)
-        tracer = TakeTracer(take, plan.variant, plan.threads, plan.half)
-        last = len(take.cameras) - 1
-        tracer.place(last)
-        final = tracer.noisy(last)
-        if shows_enough(final, take.void) and tracer.noise(last) < _NOISIEST:
-            break
+    draws = (draw_take(number, assets, each, frames=plan.frames, size=plan.size) for each in range(ATTEMPTS))
+    take, tracer, final = first_worth(draws, lambda take: TakeTracer(take, plan.variant, plan.threads, plan.half))
+    last = len(take.cameras) - 1
     arrays = {name: np.empty((last + 1, *image.shape), np.float32) for name, image in final.items()}
     references = min(REFERENCES, last + 1)
     means, errors = [], []
@@ -139,7 +140,7 @@ def _render(plan: TakePlan, number: int, path: Path) -> None:
     write_shard(path, header, arrays)
 
 
-def shows_enough(frame: dict[str, Array], void: bool) -> bool:
+def _shows_enough(frame: Frame, void: bool) -> bool:
     """Whether a frame is worth its references: neither black, nor nearly empty, nor one plain surface close by."""
     hit = frame["alpha"][0] > 0.5
     if hit.mean() < (0.04 if void else 0.3):

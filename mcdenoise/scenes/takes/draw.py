@@ -11,9 +11,9 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.assets import Assets
-from mcdenoise.scenes.random import distance, movements, narrowed
 from mcdenoise.scenes.random.builder import rotate
 from mcdenoise.scenes.random.cameras import shoot
+from mcdenoise.scenes.random.movements import distance, movements
 from mcdenoise.scenes.takes.furnish import Stock
 from mcdenoise.scenes.takes.places import build
 
@@ -82,7 +82,13 @@ class Take:
 
 
 def draw_take(
-    number: int, assets: Assets, attempt: int = 0, *, frames: int = FRAMES, size: tuple[int, int] | None = None
+    number: int,
+    assets: Assets,
+    attempt: int = 0,
+    *,
+    frames: int = FRAMES,
+    size: tuple[int, int] | None = None,
+    stills: bool = True,
 ) -> Take:
     """The take of a number, the same on every machine with the same assets.
 
@@ -92,6 +98,7 @@ def draw_take(
         attempt: another draw of the same number.
         frames: of a take that is no still.
         size: width and height in pixels; by default those of training.
+        stills: whether it may be a still.
     """
     place_rng, camera_rng, move_rng, rng = (
         np.random.default_rng(child) for child in np.random.SeedSequence((number, attempt)).spawn(4)
@@ -99,17 +106,17 @@ def draw_take(
     stock = Stock(assets)
     # Another attempt is a place of the same kind, so that hard kinds are as many.
     builder, void = build(place_rng, stock, float(np.random.default_rng((number, _KIND)).random()))
-    still = rng.random() < _STILLS
+    still = rng.random() < _STILLS and stills
     size = size or (_STILL if still else _CLIP)
     count = 1 if still else frames
     cameras = shoot(builder, camera_rng, count)
     # Half of them show a whole place; the others have the pixels of a larger image, with wide plain surfaces.
     zoom = math.exp(max(0.0, rng.uniform(-1, 1)) * math.log(_LARGEST_ZOOM))
-    cameras = [replace(camera, fov_x=narrowed(camera.fov_x, zoom)) for camera in cameras]
+    cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
     moves: dict[str, Array] = {}
     if not still and move_rng.random() < _MOVING:
         moves = movements(builder, move_rng, count, cameras[0])
-    scene = builder.plain_scene()
+    scene = builder.scene()
     if not still and "sky" in scene and move_rng.random() < _TURNING_SKY:
         # The sun travels, and the shadows with it.
         speed = float(move_rng.choice([-1, 1]) * np.exp(move_rng.uniform(math.log(0.2), math.log(3))))
@@ -138,6 +145,10 @@ def draw_take(
         white_lamps=bool(rng.random() < 0.5),
         credits=tuple(sorted(stock.credits)),
     )
+
+
+def _narrowed(fov: float, zoom: float) -> float:
+    return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) / zoom))
 
 
 def _draw(rng: np.random.Generator, weights: Mapping[_Value, float]) -> _Value:

@@ -13,15 +13,8 @@ from mcdenoise.scenes.assets import Assets, Model, Surface, read_normal_map
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, place
 from mcdenoise.scenes.random.furniture import ornament
 from mcdenoise.scenes.random.lights import light_color
-from mcdenoise.scenes.random.materials import (
-    Bsdf,
-    diffuse,
-    lacquer,
-    mirror,
-    pane,
-    random_metal,
-    rough_plastic,
-)
+from mcdenoise.scenes.random.materials import Bsdf, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
+from mcdenoise.scenes.random.rooms import furnish
 
 Rng = np.random.Generator
 Ref = dict[str, str]
@@ -211,7 +204,10 @@ class Floor:
 
 
 def fill_room(builder: SceneBuilder, rng: Rng, stock: Stock, brightness: float) -> None:
-    """Furnish a room of one theme, with small things on what has a top."""
+    """Furnish a room of one theme, with small things on what has a top; without models, with procedural pieces."""
+    if not stock.assets.models:
+        furnish(builder, rng)
+        return
     room = builder.high - builder.low
     kind = theme(rng)
     pieces, hung = stock.pieces(kind, room * (0.75, 0.95, 0.75)), stock.hung(kind)

@@ -8,14 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-_METALS = {
-    "Ag": (0.97, 0.96, 0.91),
-    "Al": (0.91, 0.92, 0.92),
-    "Au": (0.94, 0.78, 0.37),
-    "Cu": (0.93, 0.62, 0.49),
-    "Cr": (0.55, 0.55, 0.55),
-    "W": (0.50, 0.49, 0.45),
-}
+from mcdenoise.scenes.random.materials import METALS
 
 
 class Look(NamedTuple):
@@ -31,7 +24,7 @@ def look_of(bsdf: Mapping[str, Any]) -> Look:
     if kind in ("twosided", "mask", "normalmap"):
         return look_of(bsdf["bsdf"])
     if kind in ("conductor", "roughconductor"):
-        color = _METALS.get(bsdf.get("material", ""), (0.8, 0.8, 0.8))
+        color = METALS.get(bsdf.get("material", ""), (0.8, 0.8, 0.8))
         return Look(_alpha(bsdf) if kind == "roughconductor" else 0.0, color)
     if kind in ("dielectric", "thindielectric"):
         return Look(0.0, (1.0, 1.0, 1.0))

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import importlib
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.assets import Mesh
 from mcdenoise.scenes.render.tracer import Tracer
 from mcdenoise.scenes.takes.draw import Take
 from mcdenoise.scenes.takes.filters import offsets, splat
@@ -51,9 +48,7 @@ class TakeTracer:
     def __init__(self, take: Take, variant: str, threads: int = 0, half: int = HALF) -> None:
         self.take, self.half = take, half
         # Reading the scene with one thread may wait for ever; see Tracer.
-        with tempfile.TemporaryDirectory(prefix="mcdenoise-") as folder:
-            scene = _with_files(take.scene, Path(folder))
-            self._tracer = Tracer(scene, variant, MAX_DEPTH, take.moves, merge=False)
+        self._tracer = Tracer(take.scene, variant, MAX_DEPTH, take.moves, merge=False)
         self._mi, self._dr = self._tracer.mitsuba, importlib.import_module("drjit")
         if threads:
             self._dr.set_thread_count(threads)
@@ -365,39 +360,3 @@ class TakeTracer:
 def _registered(mi: Any, dr: Any, shape: Any) -> int:
     """The number by which compiled programs know a shape."""
     return int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0])
-
-
-def _with_files(scene: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The scene with its triangles in files, which can refer to materials by name."""
-    made: dict[str, Any] = {}
-    for name, entry in scene.items():
-        if isinstance(entry, Mapping) and entry.get("type") == "mesh":
-            path = folder / f"{name}.ply"
-            smooth = _write_ply(path, entry["mesh"], entry["to_world"])
-            rest = {key: value for key, value in entry.items() if key not in ("type", "mesh", "to_world")}
-            made[name] = {"type": "ply", "filename": str(path), "face_normals": not smooth, **rest}
-        else:
-            made[name] = entry
-    return made
-
-
-def _write_ply(path: Path, mesh: Mesh, to_world: Array) -> bool:
-    """Write a mesh in its place; returns whether it has normals."""
-    columns: list[NDArray[Any]] = [mesh.vertices @ to_world[:3, :3].T + to_world[:3, 3]]
-    names = ["x", "y", "z"]
-    if mesh.normals is not None:
-        normals = mesh.normals @ np.linalg.inv(to_world[:3, :3])
-        columns.append(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9))
-        names += ["nx", "ny", "nz"]
-    # Mitsuba's images begin at the top.
-    uv = np.zeros((len(mesh.vertices), 2)) if mesh.uv is None else mesh.uv * (1, -1) + (0, 1)
-    columns.append(uv)
-    names += ["u", "v"]
-    vertices = np.concatenate(columns, axis=1).astype("<f4")
-    faces = np.empty(len(mesh.faces), [("n", "u1"), ("i", "<i4", 3)])
-    faces["n"], faces["i"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
-    return mesh.normals is not None
