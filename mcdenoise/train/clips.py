@@ -89,9 +89,11 @@ class ClipSampler:
     Changing an albedo would change the light between surfaces, so albedos are not augmented.
 
     Where only the last frames of a shot have references, a clip ends with the shot, and its reference has fewer frames.
+    A clip of a shot of one frame has as many parts of it as it has frames: no network is trained on copies.
 
     Args:
-        shots: shots shorter than ``frames`` are skipped. All have references on as many of their last ``frames``.
+        shots: shots shorter than ``frames`` are skipped, except for stills, which must have references on that frame
+            and shots on as many of their last ``frames``.
         frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
         lamps: probability that a clip gets rectangles of constant radiance without noise, up to 30 times as bright as
@@ -120,11 +122,11 @@ class ClipSampler:
         tint: float = 0.0,
         gloss: float = 0.0,
     ) -> None:
-        self.shots = [shot for shot in shots if len(shot) >= frames]
+        self.shots = [shot for shot in shots if _is_enough(len(shot), frames)]
         self.frames, self.crop = frames, crop
         self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
-        self.chances = torch.tensor([float(len(shot)) for shot in self.shots])
+        self.chances = torch.tensor([float(max(len(shot), frames)) for shot in self.shots])
 
     def draw(self, seeds: Sequence[int]) -> Clip:
         """Draw a clip for each seed; the probability of a shot is proportional to its number of frames."""
@@ -133,19 +135,21 @@ class ClipSampler:
         with torch.random.fork_rng(devices=[]):
             for seed in seeds:
                 torch.default_generator.manual_seed(seed)
-                drawn.append(self._draw_one())
+                shot = self.shots[int(torch.multinomial(self.chances, 1))]
+                parts = [self._draw_one(shot) for _ in range(self.frames if len(shot) == 1 else 1)]
+                drawn.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
         return Clip({name: torch.stack([clip[name] for clip in drawn]) for name in drawn[0]})
 
-    def _draw_one(self) -> dict[str, Tensor]:
-        shot = self.shots[int(torch.multinomial(self.chances, 1))]
+    def _draw_one(self, shot: Shot) -> dict[str, Tensor]:
         height, width = shot.size
-        first = 0 if shot.references == len(shot) else len(shot) - self.frames
-        noise_seed, start = _randint(shot.noise_seeds), first + _randint(len(shot) - self.frames + 1 - first)
+        frames = min(self.frames, len(shot))
+        first = 0 if shot.references == len(shot) else len(shot) - frames
+        noise_seed, start = _randint(shot.noise_seeds), first + _randint(len(shot) - frames + 1 - first)
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = _Turn(_randint(4), bool(_randint(2)))
         clip = shot.read(
-            slice(start, start + self.frames),
+            slice(start, start + frames),
             slice(top, top + self.crop),
             slice(left, left + self.crop),
             noise_seed=noise_seed,
@@ -206,7 +210,7 @@ def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop:
     Raises:
         InputError: no shot is long enough, or one of these is smaller than the crop.
     """
-    sizes = [size for length, size in shots if length >= frames]
+    sizes = [size for length, size in shots if _is_enough(length, frames)]
     if not sizes:
         raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
     for size in sizes:
@@ -215,6 +219,10 @@ def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop:
                 f"training clips: expected images of at least {crop} pixels, found {size}; "
                 "choose a smaller --crop, a multiple of 32, or larger images"
             )
+
+
+def _is_enough(length: int, frames: int) -> bool:
+    return length >= frames or length == 1
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ class TrainConfig:
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
         loss: loss of a clip, one of mcdenoise.train.losses.LOSSES: smape, the paper's; l1_display, that of Meng et
-            al. 2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
+            al. 2020; rae, that of Chaitanya et al. 2017, whose later frames count more; or oidn, that of Open Image
+            Denoise.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.

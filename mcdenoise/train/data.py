@@ -17,7 +17,7 @@ from mcdenoise.train.cache import features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import Front
-from mcdenoise.train.packed import check_packed, describe_packed, features_of_shard, open_packed, whole
+from mcdenoise.train.packed import check_packed, describe_packed, features_of_shard, open_packed, shots_of
 from mcdenoise.train.shots import Shot
 
 # Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
@@ -117,7 +117,8 @@ class DataFolders:
             InputError: a file is damaged, or the cache cannot be written.
         """
         config = self.config
-        shots: list[Shot] = [whole(shard, self.front, self.features) for shard in self.packed]
+        handed = self.front, self.features, config.frames
+        shots: list[Shot] = [shot for each in self.packed for shot in shots_of(each, *handed, config.start_every)]
         watched: list[tuple[str, Shot]] = []
         entries: list[dict[str, Any]] = []
         for sequence in self.training:
@@ -147,7 +148,7 @@ class DataFolders:
             cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], noise_seeds=1)
             watched.append((sequence.name, cached.shots[0]))
             description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
-        watched += [(shard.path.name, whole(shard, self.front, self.features)) for shard in self.packed_validation]
+        watched += [(each.path.name, shot) for each in self.packed_validation for shot in shots_of(each, *handed)]
         if self.packed_validation:
             description["packed_validation"] = describe_packed(self.packed_validation)
         sampler = ClipSampler(

@@ -1,10 +1,10 @@
-"""Packed takes as shots to train on: read from their files, without a cache."""
+"""Packed takes as shots to train on: read from their files, and kept in memory."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +17,35 @@ from mcdenoise.frame import Frame
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Array, Shot
 
+# Radiance without its albedo may exceed half floats.
+_LARGEST = 65504.0
+
 
 @dataclass(frozen=True)
 class PackedShot(Shot):
     """Consecutive frames of a packed take.
 
+    A take is decoded and processed when it is first read, and is then kept in memory as half floats.
+
     Args:
         shard: the file.
-        front: the wrappers that process the frames, from the first one that is read and within the pixels that are
-            read: a take has no cache.
+        front: the wrappers that process the frames.
         buffers: names of the features to return.
-        first: index of the first frame.
+        start: index of the frame with which the history begins.
+        first: index of the first frame, at least ``start``.
         last: index behind the last frame.
+        kept: the arrays of the frames from ``keeps`` on, shared by all parts of this shot.
+        keeps: index of the first frame that is kept in memory.
     """
 
     shard: Shard
     front: Front
     buffers: frozenset[str]
+    start: int
     first: int
     last: int
+    keeps: int
+    kept: dict[str, Array] = field(default_factory=dict, compare=False)
 
     @property
     def noise_seeds(self) -> int:
@@ -72,30 +82,38 @@ class PackedShot(Shot):
 
     def views(self, frames: slice, rows: slice, columns: slice, noise_seed: int) -> dict[str, Array]:
         """See :meth:`mcdenoise.train.shots.Shot.views`."""
+        if not self.kept:
+            self.kept.update(self._read())
         chosen = self.cut(frames)
-        arrays: dict[str, Array] = {}
-        needed = None if self.front.wrappers else {"color", "reference", *self.buffers}
-        for name, array in self.shard.read(needed).items():
-            start = self._referenced if name == "reference" else 0
-            arrays[name] = array[max(chosen.first - start, 0) : max(chosen.last - start, 0), :, rows, columns]
-        if self.front.wrappers:
-            arrays |= self._processed(arrays)
-        kept = {*self.front.parts, *self.buffers} | ({"reference"} if chosen.references else set())
-        return {name: array for name, array in arrays.items() if name in kept}
+        found: dict[str, Array] = {}
+        for name, array in self.kept.items():
+            start = max(self._referenced, self.keeps) if name == "reference" else self.keeps
+            found[name] = array[max(chosen.first - start, 0) : max(chosen.last - start, 0), :, rows, columns]
+        return {name: array for name, array in found.items() if len(array)}
+
+    def _read(self) -> dict[str, Array]:
+        """The frames that are kept, as the front processes them."""
+        processed = self.front.wrappers
+        arrays: dict[str, Array] = self.shard.read(None if processed else {"color", "reference", *self.buffers})
+        reference = arrays.pop("reference")[max(self.keeps - self._referenced, 0) :]
+        arrays = {name: array[self.start :] for name, array in arrays.items() if name != ERROR}
+        wanted = {*self.front.parts, *self.buffers}
+        found = {name: array[self.keeps - self.start :] for name, array in arrays.items() if name in wanted}
+        return found | (self._processed(arrays) if processed else {}) | {"reference": reference}
 
     def _processed(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """What the front makes of each frame."""
-        images: dict[str, Any] = {
-            name: torch.from_numpy(array.astype(np.float32))
-            for name, array in arrays.items()
-            if name not in ("reference", ERROR)
-        }
-        step, found = self.front.begin(), []
+        step = self.front.begin()
+        found: dict[str, list[Array]] = {name: [] for name in self.front.parts}
         for t in range(len(arrays["color"])):
-            frame = Frame(**{name: image[t : t + 1] for name, image in images.items()})
-            seen = dict(step(frame.validate()[0]).items())
-            found.append({name: seen[name].numpy() for name in self.front.parts})
-        return {name: np.concatenate([each[name] for each in found]) for name in self.front.parts}
+            images: dict[str, Any] = {
+                name: torch.from_numpy(array[t : t + 1].astype(np.float32)) for name, array in arrays.items()
+            }
+            seen = dict(step(Frame(**images).validate()[0]).items())
+            if t >= self.keeps - self.start:
+                for name, kept in found.items():
+                    kept.append(seen[name].clamp(max=_LARGEST).half().numpy())
+        return {name: np.concatenate(kept) for name, kept in found.items()}
 
 
 def open_packed(paths: Iterable[Path]) -> list[Shard]:
@@ -120,9 +138,25 @@ def features_of_shard(shard: Shard) -> frozenset[str]:
     return frozenset(shard.shapes) - {"color", "reference", ERROR}
 
 
-def whole(shard: Shard, front: Front, buffers: frozenset[str]) -> PackedShot:
-    """All frames of a packed take."""
-    return PackedShot(shard, front, buffers, 0, len(shard))
+def shots_of(
+    shard: Shard, front: Front, buffers: frozenset[str], frames: int, start_every: int = 0
+) -> Iterator[PackedShot]:
+    """A packed take as a shot with all its history, and as one that begins later.
+
+    Args:
+        shard: the take.
+        front: the wrappers that process the frames.
+        buffers: names of the features to return.
+        frames: number of frames at the end that are wanted with the history of the others; a front without a history
+            is handed all frames.
+        start_every: the shorter history begins at a multiple of this, which differs from take to take; 0 for none.
+    """
+    last = len(shard)
+    first = max(last - frames, 0) if front.accumulates else 0
+    yield PackedShot(shard, front, buffers, 0, first, last, first)
+    if front.accumulates and start_every and (later := range(start_every, first + 1, start_every)):
+        start = later[int(shard.digest, 16) % len(later)]
+        yield PackedShot(shard, front, buffers, start, first, last, first)
 
 
 def describe_packed(shards: list[Shard]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ MODELS = [
 # For the other methods the library decides on derivatives, or there are none.
 DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
 # The alpha of a method without kernels is filtered by its own noise; its layers are split by their fractions.
-WITHOUT_KERNELS = (*OIDN, "oidn_tuned", "oidn_tuned_exact", "oidn_tuned_small", "rae")
+WITHOUT_KERNELS = (*OIDN, "oidn_tuned", "oidn_tuned_exact", "oidn_tuned_small", "rae", "wild", "wild_small")
 # The history of these is of images, or of hidden features, alone: no layer of a frame reaches the next frame's layers.
 HISTORY_OF_IMAGES = ("oidn_tuned", "oidn_tuned_exact", "oidn_tuned_small", "rae")
 NAMES = ("diffuse", "glossy", "emission")

@@ -12,7 +12,9 @@ from torch.autograd import gradcheck
 
 from mcdenoise.errors import InputError
 from mcdenoise.models import Output
-from mcdenoise.train.losses import LOSSES, Loss, rae_loss, stage_loss, stage_weights
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops._steps.transfer import compress
+from mcdenoise.train.losses import LOSSES, Loss, oidn_loss, rae_loss, stage_loss, stage_weights
 
 BOTH = {"image": 1.0, "initial": 1.0}
 
@@ -140,6 +142,35 @@ def test_the_gradient_of_the_recurrent_autoencoders_loss() -> None:
     reference = torch.rand(1, 3, 3, 3, 4, dtype=torch.float64)
     image = (torch.expm1(0.01 * error + 1) + reference).requires_grad_()
     assert gradcheck(rae_loss, (image, reference))
+
+
+def test_the_denoisers_loss_is_its_equation() -> None:
+    """One scale: the image is as large as the window, so that its only pixel is a weighted mean over the image."""
+    image, reference = (torch.rand(2, 2, 3, 11, 11, dtype=torch.float64) for _ in range(2))
+    exposure = oidn_exposure(reference[:, 1])[:, None]
+    shown, wanted = compress(image * exposure), compress(reference * exposure)
+    row = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / 4.5)
+    window = row[:, None] * row / row.sum() ** 2
+
+    def mean(x: Tensor) -> Tensor:
+        return (x * window).sum((-2, -1))
+
+    a, b = mean(shown), mean(wanted)
+    var_a, var_b, both = mean(shown**2) - a * a, mean(wanted**2) - b * b, mean(shown * wanted) - a * b
+    alike = (2 * a * b + 1e-4) * (2 * both + 9e-4) / ((a * a + b * b + 1e-4) * (var_a + var_b + 9e-4))
+    error = shown - wanted
+    flicker = (error[:, 1] - error[:, 0]).abs().mean()
+    expected = 0.16 * error.abs().mean() + 0.84 * (1 - alike.mean()) + 0.3 * flicker
+    torch.testing.assert_close(oidn_loss(image, reference, temporal_weight=0.3), expected)
+    with pytest.raises(ValueError, match="as reference"):
+        oidn_loss(image, reference[:, :1])
+
+
+def test_the_gradient_of_the_denoisers_loss_on_two_scales() -> None:
+    image, reference = (0.2 + torch.rand(1, 2, 3, 23, 23, dtype=torch.float64) for _ in range(2))
+    image.requires_grad_()
+    assert gradcheck(lambda x: oidn_loss(x, reference), (image,), fast_mode=True)
+    assert float(oidn_loss(reference, reference)) == pytest.approx(0, abs=1e-12)
 
 
 def test_every_loss_has_its_name() -> None:

@@ -1,0 +1,102 @@
+"""The equation of ``wild``, and the weights that it starts with; what every model promises is in test_models.py."""
+
+from __future__ import annotations
+
+import importlib.util
+from typing import Any
+
+import pytest
+import torch
+from toys import frame_of, refused
+
+from mcdenoise.frame import Frame
+from mcdenoise.models import create_model, start_with
+from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
+from mcdenoise.models.wild import _LOGITS, WildNetwork
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops._steps.transfer import compress, expand
+
+SIZE = (32, 64)
+has_oidn = pytest.mark.skipif(
+    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
+)
+
+
+def given(length: float) -> Frame:
+    """A frame with this many frames of history, and a previous result."""
+    frame = frame_of(*SIZE).to(torch.float64)
+    draws = torch.Generator().manual_seed(1)
+    alone, before = (torch.rand(1, 3, *SIZE, generator=draws, dtype=torch.float64) for _ in range(2))
+    count = torch.full((1, 1, *SIZE), length, dtype=torch.float64)
+    extra = {PREVIOUS: before, PREVIOUS_WEIGHT: torch.full_like(count, 0.4)}
+    return frame.replace(current=alone, length=count, extra=extra)
+
+
+def network(own: float, logits: tuple[float, ...], stem: int) -> WildNetwork:
+    """A network in float64 that predicts the same image and the same logits for every pixel."""
+    made = WildNetwork(stem=stem, previous=True).double().eval()
+    bias = made.unet.last.bias
+    assert bias is not None
+    predicted = [own] * 3 + [a - b for a, b in zip(logits, _LOGITS, strict=True)]
+    with torch.no_grad():
+        made.unet.last.weight.zero_()
+        bias.zero_()[:7] = torch.tensor(predicted, dtype=torch.float64)
+    return made
+
+
+@pytest.mark.parametrize("stem", [1, 2])
+@pytest.mark.parametrize("length", [1.0, 4.0, None])
+def test_the_image_is_the_weighted_mean_of_four_images(length: float | None, stem: int) -> None:
+    logits, frame = (0.4, -0.2, 0.1, -0.5), given(length or 1)
+    frame = frame if length else frame.replace(length=None, current=None)
+    image = network(0.31, logits, stem)(frame)[0].image
+    albedo, alone = frame.albedo, frame.color if frame.current is None else frame.current
+    assert albedo is not None
+    radiance = [frame.color, frame.extra[PREVIOUS], alone]
+    images = [remodulate(each, albedo) for each in radiance]
+    images[1] = torch.lerp(images[0], images[1], 0.4)
+    exposure, part = oidn_exposure(images[0]), 0.4 if length is None else 1 - 1 / length
+    weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
+        [1, part, part, 1], dtype=torch.float64
+    )
+    weights /= weights.sum()
+    expected = 0.31 * weights[0] + sum(w * compress(x * exposure) for w, x in zip(weights[1:], images, strict=True))
+    torch.testing.assert_close(image, demodulate(expand(expected) / exposure, albedo), rtol=1e-12, atol=1e-12)
+
+
+def test_the_previous_result_is_seen_on_request_only() -> None:
+    torch.manual_seed(0)
+    model, frame = WildNetwork().double().eval(), given(4.0)
+    assert PREVIOUS not in model.needs.uses
+    assert torch.equal(model(frame)[0].image, model(frame.replace(extra={}))[0].image)
+
+
+def test_every_pixel_of_a_block_has_its_own_prediction() -> None:
+    torch.manual_seed(0)
+    model = WildNetwork(stem=2).double().eval()
+    seen = torch.rand(1, 16, 32, 32, dtype=torch.float64)
+    predicted = model._predicted(seen)
+    assert predicted.shape == (1, 7, 32, 32)
+    blocks = torch.nn.functional.pixel_unshuffle(predicted, 2).unflatten(1, (7, 4))
+    assert (blocks.std(2) > 0).all()
+
+
+@has_oidn
+def test_it_starts_as_the_library() -> None:
+    model: Any = create_model("wild")
+    library = create_model("oidn_open", quality="fast")
+    assert len(start_with(model, "oidn_open", quality="fast")) == 64
+    frame = frame_of(48, 64)
+    with torch.no_grad():
+        image, expected = model.eval()(frame)[0].image, library(frame)[0].image
+    exposure = oidn_exposure(frame.color)
+    difference = (compress(image * exposure) - compress(expected * exposure)).abs().max()
+    # The frame has a weight of e^-4 / (1 + e^-4), on a scale from 0 to 1.
+    assert float(difference) < 0.02
+
+
+def test_settings_are_checked() -> None:
+    assert refused(lambda: create_model("wild", stem=0)) == "stem: expected at least 1, found 0"
+    message = "history: expected accumulated, previous or both, found 'none'"
+    assert refused(lambda: create_model("wild", history="none")) == message
