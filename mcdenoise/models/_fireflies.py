@@ -1,4 +1,4 @@
-"""Which bright pixels are fireflies, and how much light they have: not those that were bright in the frame before."""
+"""Which bright pixels are fireflies, and how much light they have: not those that were bright in the frames before."""
 
 from __future__ import annotations
 
@@ -11,56 +11,76 @@ from torch import Tensor
 from mcdenoise.models._reads import at_hand
 from mcdenoise.ops._steps.history import incoming
 
-# A pixel may be this many times as bright as it was in the frame before. What is clamped there is believed a little
-# more in every frame, so that a star a thousand times as bright as its sky has its light from the fourth or fifth frame
-# on, while two fireflies in one place remain fireflies.
+# Of a pixel that is clamped in several frames in a row, the first one is believed to be as bright as its neighbours,
+# and each later one this many times as bright as the one before. So a star a thousand times as bright as its sky has
+# its light from the fifth frame on, while two fireflies in one place remain fireflies, also where the limit is 15.
 GAIN = 6.0
 # Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
 
-def steady(light: Tensor, clamped: Tensor, before: Tensor, motion: Tensor | None) -> Tensor | None:
-    """The clamped light, and where it was bright before as much more as that allows.
+def believed(full: Tensor, least: Tensor, limit: Tensor, before: Tensor | None, motion: Tensor | None) -> Tensor:
+    """How much of the light of each pixel lasts, and so is no firefly: what is above the clamped light passes.
 
     Args:
-        light: ``(B, 3, H, W)`` before clamping.
-        clamped: ``(B, 3, H, W)`` after it.
-        before: ``(B, C, H, W)`` of the frames before, clamped: three channels, or their sum.
+        full: ``(B, 1, H, W)`` light before clamping, see :func:`light_of`.
+        least: ``(B, 1, H, W)`` after it.
+        limit: ``(B, 1, 1, 1)`` of :func:`mcdenoise.ops.clamp_fireflies`.
+        before: the result for the frame before; ``None`` for a first frame.
         motion: ``(B, 2, H, W)`` to the frame before; ``None`` if nothing moves, or where nothing tells what does.
 
     Returns:
-        ``(B, 3, H, W)``; ``None``, if values can be read, where it would be the clamped light.
+        ``(B, 1, H, W)``, at most ``full``, without derivatives.
     """
-    full, least, allowed = (image.sum(1, keepdim=True) for image in (light, clamped, before.detach()))
-    known = at_hand(light.device)
-    if known and not (full > least).any():
-        return None
-    bound = torch.maximum(GAIN * _moved(allowed, motion), least)
-    passes = (full > least) & (bound > least)
-    if known and not passes.any():
-        return None
-    ratio = torch.minimum(bound / torch.where(full > 0, full, 1), torch.ones_like(full))
-    return torch.where(passes, light * ratio, clamped)
+    full, least = full.detach(), least.detach()
+    neighbours, bright = least / limit, full > least
+    if before is None:
+        return neighbours
+    if at_hand(full.device):
+        batch, _, rows, columns = bright.nonzero(as_tuple=True)
+        if not len(rows):
+            return neighbours
+        place = (batch, torch.zeros_like(batch), rows, columns)
+        bound = GAIN * _moved(before, motion, batch, rows, columns)
+        return neighbours.index_put(place, torch.maximum(neighbours[place], torch.minimum(full[place], bound)))
+    (count, _, height, width), device = full.shape, full.device
+    batch = torch.arange(count, device=device)[:, None, None]
+    bound = _moved(
+        before, motion, batch, torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
+    )
+    bound = GAIN * bound[:, None]
+    return torch.where(bright, torch.maximum(neighbours, torch.minimum(full, bound)), neighbours)
 
 
-def _moved(image: Tensor, motion: Tensor | None) -> Tensor:
-    """The largest of the pixels around the place of each pixel in the frame before; 0 outside of it.
+def _moved(image: Tensor, motion: Tensor | None, batch: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """The largest of the pixels around the places of some pixels in the frame before; 0 outside of it.
 
     A light of one pixel that moves by a third of a pixel stays in its pixel twice, and then is in the next one.
     """
     if motion is None:
-        return image
+        return image[batch, 0, rows, columns]
     height, width = image.shape[2:]
-    motion = motion.to(torch.promote_types(motion.dtype, torch.float32)).nan_to_num(torch.inf)
-    x = torch.arange(width, device=image.device) + motion[:, 0]
-    y = torch.arange(height, device=image.device)[:, None] + motion[:, 1]
-    found = torch.zeros_like(image)
+    x, y = (motion[batch, axis, rows, columns].to(torch.promote_types(motion.dtype, torch.float32)) for axis in (0, 1))
+    x, y = columns + x.nan_to_num(torch.inf), rows + y.nan_to_num(torch.inf)
+    found = torch.zeros_like(x, dtype=image.dtype)
     for row, column in itertools.product((y.floor(), y.ceil()), (x.floor(), x.ceil())):
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        place = torch.where(inside, row, 0).long() * width + torch.where(inside, column, 0).long()
-        there = image.flatten(1).gather(1, place.flatten(1)).reshape_as(image)
-        found = torch.where(inside[:, None], torch.maximum(found, there), found)
+        there = image[batch, 0, torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long()]
+        found = torch.where(inside, torch.maximum(found, there), found)
     return found
+
+
+def light_of(color: Tensor) -> Tensor:
+    """``(B, 1, H, W)`` sum of the three channels; a reduction over them takes many times as long."""
+    return color[:, :1] + color[:, 1:2] + color[:, 2:]
+
+
+def with_light(color: Tensor, before: Tensor, after: Tensor) -> Tensor:
+    """The color of pixels whose light, the sum of channels, was one and shall be another."""
+    # A quotient of equal numbers is exactly 1. The derivative of 0 / 0 would be NaN.
+    lit = before > 0
+    factor = torch.where(lit, after / torch.where(lit, before, 1), 1)
+    return (color * factor).to(color.dtype)
 
 
 def clamped_fraction(light: Tensor, clamped: Tensor) -> Tensor:

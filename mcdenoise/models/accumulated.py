@@ -12,7 +12,7 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
-from mcdenoise.models._fireflies import light_of_fireflies
+from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, with_light
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._motion import comparable, is_still, motion_unless_still, surface_before
@@ -65,6 +65,8 @@ class History(NamedTuple):
         limit: ``(B, 1, 1, 1)`` limit of fireflies in this shot, see :func:`mcdenoise.ops.clamp_fireflies`.
         carried: for each layer, then for the alpha, then for each buffer of ``also``, the channels of ``color`` that
             are no compressed radiance; ``None`` for a buffer that the frame lacked.
+        light: ``(B, 1, H, W)`` how much light lasts, see :func:`mcdenoise.models._fireflies.believed`; ``None`` where
+            no fireflies are clamped.
     """
 
     color: Tensor
@@ -73,6 +75,55 @@ class History(NamedTuple):
     view_projection: Tensor | None
     limit: Tensor
     carried: _Carried = ()
+    light: Tensor | None = None
+
+
+class _Blended(NamedTuple):
+    """A frame with its history.
+
+    Args:
+        color: as in :class:`History`.
+        length: likewise.
+        carried: likewise.
+        entering: see :func:`mcdenoise.ops._steps.history.incoming`.
+        limit: limit of the fireflies of this frame.
+        next_limit: likewise, of the next one; 0 where that is chosen anew.
+        seen: where a light is seen, see :func:`mcdenoise.ops._steps.history.lights`.
+        motion: to the frame before; ``None`` if nothing moves.
+        still: whether that is so.
+        reset: why there is no history; empty if there is one.
+        found: fraction of the pixels that have a history.
+        cut: whether there is a cut, where that is known on the device only.
+    """
+
+    color: Tensor
+    length: Tensor
+    carried: _Carried
+    entering: Tensor
+    limit: Tensor
+    next_limit: Tensor
+    seen: Tensor | None
+    motion: Tensor | None
+    still: bool | Tensor
+    reset: str
+    found: Tensor | None = None
+    cut: Tensor | None = None
+
+    @property
+    def note(self) -> Note:
+        """What the report says about the history."""
+        if self.cut is None:
+            return Note("history", self.reset, value=self.found)
+        return Note("history", "cut", self.cut.float(), self.found, otherwise="")
+
+    def history(self, frame: Frame, light: Tensor | None) -> History:
+        """The history for the next frame."""
+        label = self.seen
+        # In most frames no light is seen, and all labels are 0.
+        if label is not None and not (at_hand(label.device) and not label.any()):
+            label = label * _steady(self.color)
+        surface = Surface(frame.position, frame.normal, frame.depth, label)
+        return History(self.color, self.length, surface, frame.view_projection, self.next_limit, self.carried, light)
 
 
 class Accumulated(Wrapper):
@@ -92,7 +143,9 @@ class Accumulated(Wrapper):
 
     Fireflies are clamped before accumulation. Where clamping would remove more than 10 % of the light of the median
     32x32 block of a shot's first frame (separately for each image of a batch), the shot has caustics, and the limit is
-    120. :func:`mcdenoise.ops._steps.history.blend` shortens the histories of mirrors and of changing light.
+    120. Light that is there in frame after frame is no firefly: the method does not see it, as it would take it for
+    noise, and it is added to the image as it is. :func:`mcdenoise.ops._steps.history.blend` shortens the histories of
+    mirrors and of changing light.
 
     A lamp in the plane of a ceiling, with the albedo of the ceiling, is the same surface by all tests, and bilinear
     taps would carry its light over its edge, a little further with every frame. So pixels that see a light take their
@@ -170,84 +223,101 @@ class Accumulated(Wrapper):
         kept, inner = own_pair(state, "accumulated")
         channels = RECENT.stop if math.isfinite(self.lag_threshold) else COLOR.stop
         history = own_state(kept, History, frame, channels=channels)
-        accumulated, history, inner, notes = self._accumulate(frame.with_depth(), history, inner)
-        del frame
-        output, inner = self.inner(accumulated, inner)
-        output = completed(accumulated, output)
-        stages = {"accumulated": accumulated.color, **output.stages}
-        after = None if history is None and inner is None else (history, inner)
-        return output._replace(stages=stages).noted(*notes), after
+        frame = frame.with_depth()
+        reset = self._reset(frame, history)
+        keeps = frame.hints.keep_all or not frame.hints.last
+        # A frame without a history, which will not be part of one, needs no test for lag.
+        compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
+        found = self._blended(frame, None if reset else history, reset, compared)
+        if found.reset:
+            inner = None
+        elif (cut := found.cut) is not None:
+            inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
+        light, passing = self._lasting(frame, None if found.reset not in ("", _NO_WAY) else history, found)
+        still = found.still is True
+        notes = [*self._notes(frame, still=still, keeps=keeps), found.note]
+        after = found.history(frame, light) if keeps else None
+        # Statistics of the noisy image are not passed on.
+        made = {"color": found.color[:, COLOR], "current": found.entering[:, COLOR], "length": found.length}
+        given = frame.replace(**made, statistics={}, hints=frame.hints._replace(still=still))
+        given = self._with_carried(given, found.carried)
+        del frame, found, made
+        output, inner = self.inner(given, inner)
+        output = completed(given, output)
+        stages = {"accumulated": given.color, **output.stages}
+        if passing is not None:
+            layers = {name: layer + passing.layers[name] for name, layer in output.layers.items()}
+            output = output._replace(image=output.image + passing.image, layers=layers)
+        next_state = None if after is None and inner is None else (after, inner)
+        return output._replace(stages=stages).noted(*notes), next_state
 
-    def _accumulate(
-        self, frame: Frame, history: History | None, inner: State
-    ) -> tuple[Frame, History | None, State, list[Note]]:
-        """The frame with its history, that for the next one, the state that the method inside may have, and notes."""
-        # In a graph and on a GPU no value is read: both branches of each decision are computed.
-        blind = not at_hand(frame.color.device)
+    def _reset(self, frame: Frame, history: History | None) -> str:
+        """Why the frame cannot have this history; empty if it can, unless there is a cut."""
         can_move = tells_motion(frame.buffers)
         reset = "" if history is None else _misfit(history, frame) or self._other_buffers(history, frame)
         surfaces = (frame, frame if history is None else history.surface)
         if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):
             reset = reset or "no position and normal, which the rule compares"
-        reset = reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
-        keeps = frame.hints.keep_all or not frame.hints.last
-        # A frame without a history, which will not be part of one, needs no test for lag.
-        compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
-        limit = self._chosen(frame.color) if reset or history is None else history.limit
-        if blind and not reset:
+        return reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
+
+    def _blended(self, frame: Frame, history: History | None, reset: str, compared: bool) -> _Blended:
+        """The frame with its history, where it has one and there is no cut."""
+        # In a graph and on a GPU no value is read: both branches of each decision are computed.
+        blind = not at_hand(frame.color.device)
+        limit = self._chosen(frame.color) if history is None else history.limit
+        if blind and history is not None:
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
         entering = incoming(frame.color, None, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
-        carried: _Carried = ()
-        still: bool | Tensor = False
-        found: Tensor | None = None
-        blind_cut: Tensor | None = None
-        if not reset and history is not None:
-            still = is_still(frame, history.view_projection)
-            color, length, kept = self._blend(frame, entering, history.color, seen, history, still)
-            found = kept.mean()
-            cut = found < CUT_FRACTION
-            if blind or not cut:
-                carried = self._blend_carried(frame, entering, seen, history, still)
-            if blind:
-                color = torch.where(cut, without_history(entering), color)
-                carried = tuple(
-                    None if part is None or old is None else torch.where(cut, part, old)
-                    for part, old in zip(self._first(frame, entering), carried, strict=True)
-                )
-                length = torch.where(cut, 1, length)
-                limit = torch.where(cut, 0, limit)
-                inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
-                blind_cut = cut.float()
-            elif cut:
-                reset = "cut"
-                # The light of the new shot may differ, and the cut is found only here.
-                chosen = self._chosen(frame.color)
-                if not torch.equal(chosen, limit):
-                    limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
-        if reset:
-            color = without_history(entering)
-            length = torch.ones_like(entering[:, :1])
-            carried = self._first(frame, entering)
-            inner, still = None, False
-        still_for_sure = not blind and bool(still)
-        notes = self._notes(frame, still=still_for_sure, can_move=can_move, keeps=keeps)
-        if blind_cut is None:
-            notes.append(Note("history", reset, value=found))
-        else:
-            notes.append(Note("history", "cut", blind_cut, found, otherwise=""))
-        after = None
-        current = entering[:, COLOR]
-        del entering
-        if keeps:
-            # In most frames no light is seen, and all labels are 0.
-            label = seen if seen is None or (not blind and not seen.any()) else seen * _steady(color)
-            surface = Surface(frame.position, frame.normal, frame.depth, label)
-            after = History(color, length, surface, frame.view_projection, limit, carried)
-        hints = frame.hints._replace(still=still_for_sure)
-        # Statistics of the noisy image are not passed on.
-        seen_inside = {"color": color[:, COLOR], "current": current, "length": length, "statistics": {}}
-        return self._with_carried(frame.replace(**seen_inside, hints=hints), carried), after, inner, notes
+        if history is None:
+            return self._begun(frame, entering, limit, seen, reset)
+        still = is_still(frame, history.view_projection)
+        motion = motion_unless_still(frame, history.view_projection, still)
+        color, length, kept = self._blend(frame, entering, history.color, seen, history, motion)
+        found = kept.mean()
+        cut = found < CUT_FRACTION
+        if not blind and cut:
+            # The light of the new shot may differ, and the cut is found only here.
+            chosen = self._chosen(frame.color)
+            if not torch.equal(chosen, limit):
+                limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
+            return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
+        carried = self._blend_carried(frame, entering, seen, history, motion)
+        made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found)
+        if not blind:
+            return made
+        carried = tuple(
+            None if part is None or old is None else torch.where(cut, part, old)
+            for part, old in zip(self._first(frame, entering), carried, strict=True)
+        )
+        color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
+        return made._replace(
+            color=color, length=length, carried=carried, next_limit=torch.where(cut, 0, limit), cut=cut
+        )
+
+    def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
+        """A frame without a history."""
+        color, length = without_history(entering), torch.ones_like(entering[:, :1])
+        return _Blended(color, length, self._first(frame, entering), entering, limit, limit, seen, None, False, reset)
+
+    def _lasting(self, frame: Frame, history: History | None, found: _Blended) -> tuple[Tensor | None, Output | None]:
+        """How much light lasts, for the next frame; and what of this frame passes the method, ``None`` for nothing."""
+        if self.firefly_limit == math.inf:
+            return None, None
+        clamped = found.entering[:, COLOR]
+        full, least = light_of(frame.color.to(clamped.dtype)), light_of(clamped)
+        before = None if history is None else history.light
+        if before is not None and found.cut is not None:
+            before = torch.where(found.cut, 0, before)
+        light = believed(full, least, found.limit.to(full.dtype), before, found.motion)
+        if at_hand(light.device) and not (light > least).any():
+            return light, None
+        after = torch.maximum(light, least)
+        layers = {
+            name: with_light(layer, full, after) - with_light(layer, full, least)
+            for name, layer in frame.layers.items()
+        }
+        return light, Output(with_light(frame.color.to(clamped.dtype), full, after) - clamped, layers=layers)
 
     def _first(self, frame: Frame, entering: Tensor) -> _Carried:
         """Layers, alpha and the buffers of ``also`` of a frame without a history."""
@@ -257,7 +327,7 @@ class Accumulated(Wrapper):
         return tuple(torch.cat([part, part], 1) if twice and part is not None else part for part in parts)
 
     def _blend_carried(
-        self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, still: bool | Tensor
+        self, frame: Frame, entering: Tensor, seen: Tensor | None, history: History, motion: Tensor | None
     ) -> _Carried:
         """Layers, alpha and the buffers of ``also`` of a frame, with their histories.
 
@@ -272,7 +342,7 @@ class Accumulated(Wrapper):
             previous = [before[:, COLOR], history.color[:, MEAN.start : SQUARE.stop], before[:, COLOR.stop :]]
             previous = [*previous, history.color[:, RECENT_MEAN]] if decisive.shape[1] else previous
             together = torch.cat([part, decisive], 1), torch.cat(previous, 1)
-            color = self._blend(frame, *together, seen, history, still)[0]
+            color = self._blend(frame, *together, seen, history, motion)[0]
             recent = color[:, RECENT.start : RECENT_MEAN.start]
             blended.append(torch.cat([color[:, COLOR], recent], 1) if decisive.shape[1] else color)
         return tuple(blended)
@@ -284,10 +354,9 @@ class Accumulated(Wrapper):
         before: Tensor,
         seen: Tensor | None,
         history: History,
-        still: bool | Tensor,
+        motion: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Color and length of the frame with its history, and how many pixels of each image have one."""
-        motion = motion_unless_still(frame, history.view_projection, still)
         surface, previous = surface_before(frame)._replace(label=seen), history.surface
         if self.rule == "relative":
             surface, previous = comparable(surface, previous)
@@ -350,7 +419,8 @@ class Accumulated(Wrapper):
             return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
         return torch.where(light_of_fireflies(color) > _LOST, CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
 
-    def _notes(self, frame: Frame, *, still: bool, can_move: bool, keeps: bool) -> list[Note]:
+    def _notes(self, frame: Frame, *, still: bool, keeps: bool) -> list[Note]:
+        can_move = tells_motion(frame.buffers)
         source = "motion" if frame.motion is not None else "positions and cameras"
         lost = "" if can_move else "no motion, and no positions with cameras: single frames"
         alone = "one frame" if frame.hints.alone and not frame.hints.keep_all else lost

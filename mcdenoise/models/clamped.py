@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._fireflies import GAIN, clamped_fraction, light_of_fireflies, steady
+from mcdenoise.models._fireflies import GAIN, believed, clamped_fraction, light_of, light_of_fireflies, with_light
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._motion import motion_to_previous
 from mcdenoise.models._state import own_pair, own_state
@@ -32,7 +32,7 @@ class Kept(NamedTuple):
     """What is known of the frame before.
 
     Args:
-        light: ``(B, 1, H, W)`` its demodulated radiance without fireflies, the sum of its channels.
+        light: ``(B, 1, H, W)`` how much of its demodulated radiance was believed to last.
         view_projection: ``(B, 4, 4)`` its camera.
     """
 
@@ -43,9 +43,8 @@ class Kept(NamedTuple):
 class Clamped(Wrapper):
     """Hands a method frames with clamped fireflies, see :func:`without_fireflies`.
 
-    Light that lasts is none: a pixel may be six times as bright as in the frame before. Nor is a bright pixel of a
-    frame that has hardly any noise. The method does not see such light, which it would take for noise: it is added to
-    the image as it is.
+    Light that is there in frame after frame is none. Nor is a bright pixel of a frame that has hardly any noise. The
+    method does not see such light, which it would take for noise: it is added to the image as it is.
 
     Args:
         inner: any method.
@@ -90,25 +89,16 @@ def _clamped(frame: Frame, kept: Kept | None) -> tuple[Frame, Tensor, Kept | Non
     common = ((light_of_fireflies(light) - _RARE) / (_COMMON - _RARE)).clamp(0, 1)
     limit = (_LIMIT * (CAUSTICS / _LIMIT) ** common).reshape(-1, 1, 1, 1).to(light.dtype)
     clamped = incoming(light, None, limit, compared=False)
-    full, least = (image.sum(1, keepdim=True) for image in (light, clamped))
+    full, least = light_of(light), light_of(clamped)
     # What the neighbours of a bright pixel have in the mean takes its place, as its own light is no noise of theirs.
-    without = _scaled(frame.color.detach(), full.detach(), torch.where(least < full, least / limit, full).detach())
+    without = with_light(frame.color.detach(), full.detach(), torch.where(least < full, least / limit, full).detach())
     clean = noise_of(without, frame.albedo, frame.normal).level < _CLEAN
-    believed = torch.where(clean, light, clamped)
-    if kept is not None and kept.light.shape == full.shape:
-        passed = steady(light, believed, kept.light, motion_to_previous(frame, kept.view_projection))
-        believed = believed if passed is None else passed
-    after = believed.sum(1, keepdim=True)
-    color, bright = _scaled(frame.color, full, least), _scaled(frame.color, full, after)
+    before = None if kept is None or kept.light.shape != full.shape else kept
+    motion = None if before is None else motion_to_previous(frame, before.view_projection)
+    lasting = believed(full, least, limit, None if before is None else before.light, motion)
+    after = torch.where(clean, full, torch.maximum(lasting, least))
+    color, bright = with_light(frame.color, full, least), with_light(frame.color, full, after)
     note = Note("fireflies", value=clamped_fraction(frame.color, bright))
     keeps = frame.hints.keep_all or not frame.hints.last
-    kept = Kept(after.detach(), frame.view_projection) if keeps else None
+    kept = Kept(torch.where(clean, full.detach(), lasting), frame.view_projection) if keeps else None
     return frame.replace(color=color), bright - color, kept, note
-
-
-def _scaled(color: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """The color of pixels whose light, the sum of channels, was one and shall be another."""
-    # A quotient of equal numbers is exactly 1. The derivative of 0 / 0 would be NaN.
-    lit = before > 0
-    factor = torch.where(lit, after / torch.where(lit, before, 1), 1)
-    return (color * factor).to(color.dtype)
