@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
-from toys import Mean, Shot, Watching, refused, still, whole_frame
+from toys import Mean, Shot, Watching, still, whole_frame
 
 from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame, Hints
@@ -68,25 +68,6 @@ def test_images_that_are_accumulated_as_well_have_the_weights_of_the_color() -> 
         torch.testing.assert_close(seen.extra["sun"], 3 * seen.color)
         assert torch.equal(seen.extra["other"], frame.color)
     assert not torch.equal(seen.color, frame.color)
-
-
-def test_reset_makes_the_next_frame_the_first() -> None:
-    history, color = Shot(), torch.rand(1, 3, HEIGHT, WIDTH)
-    history.update(still(color + 1))
-    history.reset()
-    seen = history.update(still(color))
-    assert torch.equal(seen.color, color)
-    assert seen.reset == "first frame"
-
-
-def test_another_size_resets() -> None:
-    history = Shot()
-    history.update(still(constant(3)))
-    smaller = constant(3, 2.0, (4, 4))
-    seen = history.update(still(smaller))
-    assert torch.equal(seen.color, smaller)
-    assert seen.reset == "size change"
-    assert history.update(still(smaller)).reset == ""
 
 
 def test_a_cut_resets() -> None:
@@ -307,14 +288,6 @@ def test_a_dark_texture_beside_a_bright_one_is_no_firefly() -> None:
     torch.testing.assert_close(seen.color, constant(3, 2.0, (9, 9)))
 
 
-def test_an_infinite_limit_leaves_fireflies() -> None:
-    history, colors = Shot(alpha_min=0.1, firefly_limit=math.inf), with_firefly(0.5)
-    albedo = constant(3, 0.5, (9, 9))
-    for color in colors:
-        seen = history.update(still(color, albedo=albedo))
-    torch.testing.assert_close(seen.color, demodulate(sum(colors) / 4, albedo))
-
-
 def caustics(fraction: float, size: tuple[int, int] = (128, 160)) -> Frame:
     """Light 1, and in one pixel of 200 as much that all of these have ``fraction`` of it."""
     hit = torch.rand(1, 1, *size, generator=torch.Generator().manual_seed(0)) < 1 / 200
@@ -355,12 +328,6 @@ def test_each_image_of_a_batch_and_each_shot_has_its_own_caustics(backend: Backe
         False,
     ]
     torch.testing.assert_close(seen.color, seen.current, rtol=0, atol=0)
-
-
-def test_one_firefly_is_no_caustic_however_bright() -> None:
-    color = constant(3, 1.0, (128, 160))
-    color[..., 64, 80] = 1e9
-    assert Shot().update(still(color)).current.max() == pytest.approx(15)
 
 
 def test_who_names_a_limit_gets_it() -> None:
@@ -458,21 +425,6 @@ def test_a_mirror_of_unknown_motion_starts_anew(value: float) -> None:
         assert seen.color.isfinite().all()
         assert seen.length[0, 0, 1, 1] == 1
         assert seen.length.max() == number
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        ({"specular_length": -1.0}, "specular_length: expected at least 0, found -1.0"),
-        ({"specular_length": math.nan}, "specular_length: expected at least 0, found nan"),
-        ({"alpha_min": 0.0}, "alpha_min: expected in (0, 1], found 0.0"),
-        ({"alpha_min": -1.0}, "alpha_min: expected in (0, 1], found -1.0"),
-        ({"alpha_min": 2.0}, "alpha_min: expected in (0, 1], found 2.0"),
-        ({"alpha_min": math.nan}, "alpha_min: expected in (0, 1], found nan"),
-    ],
-)
-def test_a_setting_out_of_its_range_is_refused(settings: dict[str, float], expected: str) -> None:
-    assert refused(lambda: Shot(**settings)) == expected
 
 
 # Lights in the plane of what is around them
@@ -680,20 +632,6 @@ def test_a_state_of_zeros_is_no_state(size: tuple[int, int], by_positions: bool)
     assert pytree.tree_structure(again) == pytree.tree_structure(state)
     for one, other in zip(pytree.tree_leaves(again), pytree.tree_leaves(state), strict=True):
         assert one is other or torch.equal(one, other)
-
-
-def test_a_step_is_pure() -> None:
-    """The state that goes in is not changed: the same frame after it is the same again."""
-    model, state = Accumulated(Mean()), None
-    for number in range(12):
-        frame = still(torch.rand(1, 3, HEIGHT, WIDTH), depth=constant(1))
-        before = pytree.tree_map_only(Tensor, torch.clone, (frame, state))
-        output, after = model(frame, state)
-        for mine, copy in zip(pytree.tree_leaves((frame, state)), pytree.tree_leaves(before), strict=True):
-            assert mine is copy or torch.equal(mine, copy), number
-        again, _ = model(frame, state)
-        assert torch.equal(again.image, output.image)
-        state = after
 
 
 def test_the_inner_method_gets_the_history_and_its_image_is_the_result() -> None:

@@ -5,12 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from test_svgf import HEIGHT, WIDTH, frame
-from torch import Tensor
 
-from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model
 from mcdenoise.models.asvgf import Asvgf
 from mcdenoise.models.svgf import Svgf
 
@@ -89,39 +85,3 @@ def test_a_firefly_is_no_change_of_the_light() -> None:
     given.color[..., 12, 10] = 1e4
     _, after = model(given, state)
     assert after.length[..., 12, 10] > 6
-
-
-def test_extremes_stay_finite() -> None:
-    light = frame().color.clone()
-    light[..., ::5, ::7], light[..., ::3, ::4] = 1e16, 0
-    denoiser = Denoiser("asvgf")
-    for factor in (1.0, 1e-12, 1.0, 0.0, 1e-30):
-        image = denoiser(frame(light * factor))
-        assert image.isfinite().all()
-        assert image.min() >= 0
-
-
-def test_differentiable_through_time() -> None:
-    """The derivative includes that of the weight; two thirds of the light are gone in the second frame."""
-    frames = [
-        frame(scale * (0.9 + 0.2 * torch.rand(1, 3, 2, 3, generator=torch.Generator().manual_seed(seed)).double()))
-        for seed, scale in enumerate((3.0, 1.0))
-    ]
-    model = Asvgf(levels=1, gradient_levels=1)
-
-    def last(first: Tensor) -> Tensor:
-        _, state = model(frames[0].replace(color=first))
-        return model(frames[1], state)[0].image
-
-    assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
-
-
-def test_needs_and_settings_out_of_range() -> None:
-    model = create_model("asvgf")
-    assert "gradient" in model.needs.uses
-    assert not model.needs.trainable
-    with pytest.raises(InputError, match="buffer 'depth':"):
-        Denoiser("asvgf")(frame().replace(depth=None))
-    for name, value in {"alpha": 0.0, "levels": 0, "gradient_levels": -1, "threshold": -1.0}.items():
-        with pytest.raises(InputError, match=rf"{name}: .*{value}"):
-            create_model("asvgf", **{name: value})

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import itertools
 
-import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, create_model, parts_of
+from mcdenoise.models import create_model
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.models.bmfr import Bmfr, _start
 from mcdenoise.models.noisy import Noisy
@@ -139,40 +137,3 @@ def test_anti_aliasing_is_that_of_the_public_code() -> None:
     # This holds in any unit.
     _, state = model(Frame(1e6 * colors[:1], motion=still))
     torch.testing.assert_close(model(Frame(1e6 * colors[1:], motion=still), state)[0].image, 1e6 * second.image)
-
-
-def test_anti_aliasing_is_a_setting() -> None:
-    with_it, without = create_model("bmfr"), create_model("bmfr", taa=False)
-    assert [part.alpha for part in parts_of(with_it, Antialiased)] == [0.2]
-    assert not list(parts_of(without, Antialiased))
-    for model in (with_it, without):
-        assert [(part.alpha_min, part.rule) for part in parts_of(model, Accumulated)] == [(0.2, "bmfr")]
-    # A black frame stays black.
-    assert not Denoiser(with_it)(frame(torch.zeros(1, 3, HEIGHT, WIDTH))).any()
-
-
-def test_extremes_stay_finite() -> None:
-    given = frame()
-    given.color[..., ::5, ::7], given.color[..., ::3, ::4] = 1e16, 0
-    given.normal[..., :9, :] = 0
-    given.position[..., :9, :] = 1e6
-    denoiser = Denoiser("bmfr")
-    for factor in (1.0, 1e-30, 1.0, 0.0):
-        image = denoiser(given.replace(color=given.color * factor))
-        assert image.isfinite().all()
-        assert image.min() >= 0
-
-
-def test_needs_and_settings_out_of_range() -> None:
-    model = create_model("bmfr")
-    assert model.needs.buffers == {"color", "normal", "position"}
-    assert not model.needs.trainable
-    for absent in ("normal", "position"):
-        with pytest.raises(InputError, match=f"buffer '{absent}':"):
-            Denoiser("bmfr")(frame().replace(**{absent: None}))
-    wrong = {"alpha_min": 0.0, "second_alpha": 2.0, "block": 1, "ridge": 0.0}
-    for name, value in wrong.items():
-        with pytest.raises(InputError, match=rf"{name}: .*{value}"):
-            create_model("bmfr", **{name: value})
-    with pytest.raises(InputError, match=r"alpha: .*0"):
-        create_model("bmfr", taa_alpha=0)

@@ -11,11 +11,10 @@ from toys import frame_of, small
 
 from mcdenoise import ops
 from mcdenoise.frame import Frame
-from mcdenoise.models import Chain, CoarseToFine, create_model, overview, parts_of
+from mcdenoise.models import Chain, CoarseToFine, create_model, parts_of
 from mcdenoise.models import cascaded_v2 as page
 from mcdenoise.models.cascaded_v2 import KernelNetwork, PixelNetwork
 from mcdenoise.nn import auto_exposure
-from mcdenoise.nn.inputs import FEATURES
 from mcdenoise.ops import cross_bilateral_weights, kernel_conv
 
 WIDTH = 8
@@ -28,45 +27,6 @@ def networks(model: Any) -> tuple[PixelNetwork, KernelNetwork]:
 def chain_of(model: Any) -> Chain:
     """Both networks without their wrappers, on radiance as it is given."""
     return next(parts_of(model, Chain))
-
-
-def widths(name: str, **settings: Any) -> tuple[int, ...]:
-    return tuple(network.heads[0].in_channels for network in networks(create_model(name, **settings)))
-
-
-@pytest.mark.parametrize(
-    ("name", "expected", "taps"),
-    [
-        ("cascaded_v2", (40, 40), 25),
-        ("cascaded_v2_small", (16, 32), 25),
-        ("cascaded_v2_tiny", (16, 16), 9),
-        ("cascaded_v2_micro", (16, 16), 9),
-    ],
-)
-def test_the_sizes_of_the_family(name: str, expected: tuple[int, int], taps: int) -> None:
-    pixel, kernel = networks(create_model(name))
-    assert widths(name) == expected
-    # At half the resolution, a feature stands for two by two pixels.
-    finest = 4 if name == "cascaded_v2_micro" else 1
-    assert [head.out_channels for head in kernel.heads] == [finest * (taps + 3), taps + 3, taps + 3]
-    assert [head.out_channels for head in pixel.heads] == [finest * 3, 3, 3]
-    assert next(parts_of(create_model(name), CoarseToFine)).resolutions == 3
-
-
-def test_the_width_of_the_kernel_network_can_be_set() -> None:
-    assert widths("cascaded_v2", width=8) == (8, 8)
-    assert widths("cascaded_v2", width=8, kernel_width=12) == (8, 12)
-    assert widths("cascaded_v2_small", width=8) == (8, 32)
-    assert widths("cascaded_v2_small", width=8, kernel_width=None) == (8, 8)
-
-
-@pytest.mark.slow
-@torch.no_grad()
-def test_full_width_at_180x320() -> None:
-    output, _ = create_model("cascaded_v2")(frame_of(180, 320))
-    for image in (output.image, output.stages["initial"]):
-        assert image.shape == (1, 3, 180, 320)
-        assert torch.isfinite(image).all()
 
 
 @pytest.mark.parametrize("precision", [torch.float32, pytest.param(torch.bfloat16, marks=pytest.mark.slow)], ids=str)
@@ -209,46 +169,6 @@ def test_large_images_have_the_derivatives_of_the_reference() -> None:
         gradients.append([parameter.grad for parameter in model.parameters()])
     for fast, plain in zip(*gradients, strict=True):
         torch.testing.assert_close(fast, plain, rtol=1e-3, atol=1e-6)
-
-
-def test_initial_weights() -> None:
-    """Their results change only together with the architecture, and then every file of weights is void."""
-    torch.manual_seed(0)
-    model = create_model("cascaded_v2", width=8)
-    grid = torch.linspace(0, 1, 8 * 9).reshape(1, 1, 8, 9)
-    color = torch.cat([grid, 1 - grid, (7 * grid) % 1], 1)
-    frame = Frame(color, albedo=color.flip(1), normal=color * 2 - 1, depth=1 + grid, current=color)
-    with torch.no_grad():
-        # In training there is no mirror image around the frame.
-        output, _ = chain_of(model).train()(frame)
-    initial, final = output.stages["initial"], output.image
-    expected_initial = [[0.507042, 0.563380, 0.619718], [0.492958, 0.436620, 0.380282], [0.549296, 0.943662, 0.338028]]
-    expected_final = [[0.516916, 0.587703, 0.614132], [0.480873, 0.412624, 0.385203], [0.600575, 0.852206, 0.312455]]
-    torch.testing.assert_close(initial[0, :, 4, ::4], torch.tensor(expected_initial), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(final[0, :, 4, ::4], torch.tensor(expected_final), rtol=1e-4, atol=1e-5)
-
-
-def test_the_cost_of_the_family() -> None:
-    macs = {entry.name: entry.kmacs_per_pixel or 0.0 for entry in overview("cascaded_v2*")}
-    cost = {name: own / macs["cascaded_v2"] for name, own in macs.items()}
-    assert cost["cascaded_v2_small"] == pytest.approx(0.41, abs=0.005)
-    assert cost["cascaded_v2_tiny"] == pytest.approx(0.18, abs=0.005)
-    assert cost["cascaded_v2_micro"] == pytest.approx(0.08, abs=0.005)
-
-
-def test_the_cost_of_the_pixel_network_written_out() -> None:
-    width = 8
-    full = (3 + FEATURES + width) * width * 9
-    # At each coarser scale it is given the mean of the image.
-    encoder = sum((2 * width + 3) * width * 9 / 4**level for level in (1, 2, 3))
-    # A 2x2 transposed convolution, two convolutions of which the first sees the encoder too, and a head.
-    decoder = sum((width**2 + 3 * width * width * 9 + 3 * width * 9) / 4**level for level in (0, 1, 2))
-    fusions = sum(6 * 9 / 4**level for level in (0, 1))
-    from torch.utils.flop_counter import FlopCounterMode
-
-    with FlopCounterMode(display=False) as counter:
-        PixelNetwork(width)(frame_of(64, 64))
-    assert counter.get_total_flops() / 2 / 64**2 == pytest.approx(full + encoder + decoder + fusions, rel=1e-6)
 
 
 @torch.no_grad()

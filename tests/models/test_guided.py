@@ -7,9 +7,7 @@ import torch
 from kornia.filters import guided_blur
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model
 from mcdenoise.models.guided import Guided
 
 
@@ -69,13 +67,3 @@ def test_noise_does_not_guide_itself(model: str) -> None:
     spot[..., 24, 12] = torch.inf
     other = Denoiser(model)(Frame(spot))
     assert ((other / image - 1).abs()[..., :, 21:]).max() < 1e-2
-
-
-def test_has_no_weights_and_refuses_invalid_settings() -> None:
-    model = create_model("guided")
-    assert not list(model.parameters())
-    assert not model.needs.trainable
-    with pytest.raises(InputError, match=r"radius: .*0"):
-        create_model("guided", radius=0)
-    with pytest.raises(InputError, match="eps:"):
-        create_model("guided", eps=torch.nan)

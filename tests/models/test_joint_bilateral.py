@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from kornia.filters import joint_bilateral_blur
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Tiled, create_model, parts_of
 from mcdenoise.models.joint_bilateral import JointBilateral
@@ -83,15 +81,3 @@ def test_differentiable() -> None:
 
     leaves = given.color.requires_grad_(), given.albedo.clone().requires_grad_()
     assert torch.autograd.gradcheck(image, leaves)
-
-
-def test_has_no_weights_and_refuses_invalid_settings() -> None:
-    model = create_model("joint_bilateral")
-    assert not list(model.parameters())
-    assert not model.needs.trainable
-    with pytest.raises(InputError, match=r"sigma_color: .*0"):
-        create_model("joint_bilateral", sigma_color=0)
-    with pytest.raises(InputError, match="sigma_space:"):
-        create_model("joint_bilateral", sigma_space=torch.inf)
-    with pytest.raises(InputError, match="sigma_color, sigma_space, alpha_min"):
-        create_model("joint_bilateral", sigma=1)

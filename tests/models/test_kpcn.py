@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from toys import frame_of, refused
+from toys import frame_of
 
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models import create_model, parts_of
-from mcdenoise.models.kpcn import CHANNELS, PUBLISHED, KpcnNetwork, kpcn
+from mcdenoise.models.kpcn import CHANNELS, KpcnNetwork
 from mcdenoise.ops import luminance_moments, moments_variance
 
 
@@ -81,22 +80,6 @@ def filtered(branch: Any, image: Tensor, frame: Frame) -> Tensor:
 
 
 @torch.no_grad()
-def test_the_network_written_out() -> None:
-    """The diffuse part of the light is without albedo: the result times albedo is ``a d + exp(l) - 1``."""
-    network, frame = drawn(), parts(6, 7, emission=torch.full((1, 3, 6, 7), 0.25).double())
-    assert frame.diffuse is not None
-    assert frame.specular is not None
-    assert frame.albedo is not None
-    matt = filtered(network.diffuse, frame.diffuse, frame)
-    shiny = torch.exp(filtered(network.specular, torch.log(1 + frame.specular), frame)) - 1
-    # Demodulated divides by the albedo, at least by 0.04 where there is any.
-    albedo = frame.albedo.clamp_min(0.04)
-    output, state = network(frame)
-    torch.testing.assert_close(output.image * albedo, albedo * matt + shiny + 0.25, rtol=1e-9, atol=1e-9)
-    assert state is None
-
-
-@torch.no_grad()
 def test_color_only_is_the_diffuse_branch() -> None:
     network, frame = drawn(), parts(6, 7)
     alone = frame.replace(diffuse=None, specular=None)
@@ -140,17 +123,6 @@ def test_the_shipped_weights_are_for_color_alone() -> None:
 
 
 @torch.no_grad()
-def test_light_without_noise_comes_back() -> None:
-    """Means of equal numbers, and a logarithm that is undone: the whole model, its albedo and its exposure."""
-    frame = parts(9, 8).to(torch.float32)
-    assert frame.albedo is not None
-    model = create_model("kpcn", width=4)
-    matt, shiny = 2 * frame.albedo.clamp_min(0.04), torch.full_like(frame.color, 3.0)
-    output, _ = model(frame.replace(color=matt + shiny, diffuse=matt, specular=shiny))
-    torch.testing.assert_close(output.image, matt + shiny, rtol=1e-4, atol=1e-4)
-
-
-@torch.no_grad()
 def test_both_parts_have_a_history() -> None:
     """A still scene: what is filtered is the mean of two frames, of each part."""
     model, frame = create_model("kpcn", width=4, alpha_min=0.5), parts(9, 8).to(torch.float32)
@@ -180,22 +152,3 @@ def test_layers_are_filtered_with_the_kernels_of_their_light() -> None:
     dark = frame.replace(specular=torch.zeros_like(frame.specular), layers={"matt": frame.diffuse})
     output, _ = network(dark)
     torch.testing.assert_close(output.layers["matt"], output.image)
-
-
-def test_the_published_size() -> None:
-    """2.92 million parameters a branch with 27 inputs."""
-    with torch.device("meta"):
-        network = next(part for part in kpcn(**PUBLISHED).modules() if isinstance(part, KpcnNetwork))  # type: ignore[attr-defined]
-    for branch in (network.diffuse, network.specular):
-        assert sum(parameter.numel() for parameter in branch.parameters()) == 2_921_241
-        assert [layer.weight.shape[:2] for layer in branch if isinstance(layer, nn.Conv2d)] == [
-            (100, 27),
-            *[(100, 100)] * 7,
-            (441, 100),
-        ]
-    assert network.needs.reach == 18 + 4 + 10
-
-
-@pytest.mark.parametrize(("setting", "value"), [("width", 0), ("layers", 1), ("kernel_size", 4), ("kernel_size", 0)])
-def test_settings_out_of_range_are_refused(setting: str, value: int) -> None:
-    assert refused(lambda: create_model("kpcn", **{setting: value})).startswith(f"{setting}: expected ")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, create_model, find_model, list_models, parts_of
+from mcdenoise.models import Accumulated, parts_of
 from mcdenoise.models.noisy import Noisy
 
 
@@ -22,11 +20,6 @@ def frame(height: int = 18, width: int = 22) -> Frame:
         depth=torch.full_like(light[:, :1], 2.0),
         motion=torch.zeros(1, 2, height, width),
     )
-
-
-def test_pages_register_themselves() -> None:
-    assert {"noisy", "accumulated", "cascaded_v2"} <= set(list_models())
-    assert find_model("noisy").description == "Returns the frame's color unchanged."
 
 
 def test_noisy_is_the_color_itself() -> None:
@@ -52,23 +45,3 @@ def test_the_variance_of_a_still_shot_falls_with_the_number_of_frames() -> None:
         # An estimate of the variance from N exponential samples has a relative deviation of sqrt(8 / N) at most.
         assert abs(result.var().item() / expected - 1) < 5 * (8 / result.numel()) ** 0.5
     assert denoiser.report.reset == ""
-
-
-def test_accumulation_survives_a_cut_and_a_resize() -> None:
-    denoiser = Denoiser("accumulated")
-    for _ in range(3):
-        denoiser(frame())
-    turned = frame()
-    turned = turned.replace(normal=-turned.normal)
-    assert torch.allclose(denoiser(turned), turned.color, rtol=1e-6)
-    assert denoiser.report.reset == "cut"
-    small = frame(9, 11)
-    assert torch.allclose(denoiser(small), small.color, rtol=1e-6)
-    assert denoiser.report.reset == "size change"
-
-
-def test_settings_are_checked() -> None:
-    with pytest.raises(InputError, match=r"alpha_min: .*0"):
-        create_model("accumulated", alpha_min=0)
-    with pytest.raises(InputError, match="model 'noisy':"):
-        create_model("noisy", alpha_min=0.1)

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, create_model, parts_of
 from mcdenoise.models._published import TenChannels, displayed
@@ -23,13 +22,6 @@ def test_all_are_given_the_same_accumulation(name: str) -> None:
     # The published accumulation looks for no fireflies, mirrors or changes of light.
     assert accumulated.firefly_limit == accumulated.specular_length == accumulated.lag_threshold == math.inf
     assert accumulated.also == (("diffuse", "specular") if name == "kpcn" else ())
-
-
-@pytest.mark.parametrize("name", ["kp", "kpcn", "layered", "mrkp", "sbmc"])
-@pytest.mark.parametrize("kernel_size", [0, 4, -3])
-def test_a_kernel_without_a_centre_is_refused(name: str, kernel_size: int) -> None:
-    with pytest.raises(InputError, match=f"^kernel_size: .* {kernel_size}$"):
-        create_model(name, kernel_size=kernel_size)
 
 
 def test_the_ten_channels() -> None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
-from toys import frame_of
 
-from mcdenoise import Denoiser, Frame
+from mcdenoise import Frame
 from mcdenoise.frame import Hints
 from mcdenoise.models import Needs, Output, Recurrent, State
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
@@ -124,38 +122,9 @@ def test_positions_and_cameras_tell_motion_too() -> None:
     torch.testing.assert_close(inner.previous[..., 1:], frame.color[..., :-1])
 
 
-@pytest.mark.parametrize("names", [(), ("depth",), ("position",)])
-def test_without_motion_every_frame_is_a_first_frame(names: tuple[str, ...]) -> None:
-    inner = Shows()
-    model, state = Recurrent(inner), None
-    for seed in range(2):
-        frame = frame_of(6, 7, seed=seed)
-        frame = Frame(frame.color, **{name: frame.buffer(name) for name in names})
-        output, state = model(frame, state)
-        assert torch.equal(output.image, frame.color)
-
-
-def test_a_resize_begins_anew_and_the_state_is_tensors() -> None:
-    denoiser = Denoiser(Recurrent(Shows()))
-    for size in ((6, 8), (6, 8), (5, 4)):
-        denoiser(moving(torch.rand(1, 3, *size), (0, 0)))
-        leaves = [leaf for leaf in pytree.tree_leaves(denoiser._state) if leaf is not None]
-        assert all(isinstance(leaf, Tensor) for leaf in leaves)
-    assert denoiser.report.reset == "size change"
-
-
 def test_nothing_is_kept_of_the_last_frame() -> None:
     frame = moving(torch.rand(1, 3, 5, 6), (0, 0))
     assert Recurrent(Shows())(frame.replace(hints=Hints(last=True)))[1] is None
-
-
-def test_a_state_of_zeros_is_that_of_no_frame() -> None:
-    inner = Shows()
-    frame = moving(torch.rand(1, 3, 5, 6), (0, 0))
-    _, state = Recurrent(inner)(frame)
-    zeros = pytree.tree_map_only(Tensor, torch.zeros_like, state)
-    Recurrent(inner)(frame, zeros)
-    assert not inner.weight.any()
 
 
 def test_the_gradient_goes_through_the_state() -> None:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Blur, Mean, Same, Shot, Watching, refused, report_of, small
+from toys import Blur, Mean, Same, Shot, Watching, report_of, small
 
-from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise import Denoiser, Frame
 from mcdenoise.models import (
     Accumulated,
     Chain,
@@ -320,12 +320,6 @@ def test_a_cut_and_a_moving_camera_compute_everything_again() -> None:
     denoiser(cut.replace(normal=-cut.normal))
     assert denoiser.report.reset == "cut"
     assert stage(denoiser, "network").skipped == 0
-
-
-@pytest.mark.parametrize("tolerance", [-1.0, float("nan"), float("inf")])
-def test_a_tolerance_that_is_none_is_refused(tolerance: float) -> None:
-    for make in (lambda: Skipping(Same(), tolerance), lambda: create_model("cascaded_v2_micro", tolerance=tolerance)):
-        assert "tolerance: expected a finite number of at least 0" in refused(make)
 
 
 # Methods that know nothing of it

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model
 from mcdenoise.models.svgf import Svgf
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
 
@@ -125,64 +122,9 @@ def test_motion_comes_from_positions_and_cameras_too() -> None:
     assert results[0][1][..., :10].unique().tolist() == [2.0]
 
 
-def test_state_survives_a_cut_and_a_resize() -> None:
-    denoiser = Denoiser("svgf")
-    for seed in range(3):
-        denoiser(frame(seed=seed))
-    given = frame(seed=5)
-    given = given.replace(normal=-given.normal)
-    torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
-    small = frame(torch.rand(1, 3, 9, 11))
-    torch.testing.assert_close(denoiser(small), Denoiser("svgf")(small))
-    assert denoiser.report.reset == "size change"
-
-
 def test_a_frame_without_motion_has_no_history() -> None:
     denoiser = Denoiser("svgf")
     for seed in (0, 1):
         given = frame(seed=seed).replace(motion=None)
         torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
     assert denoiser.report.reset == "no motion"
-
-
-def test_extremes_stay_finite() -> None:
-    light = frame().color.clone()
-    light[..., ::5, ::7] = 1e30
-    light[..., ::3, ::4] = 0
-    depth = torch.full((1, 1, HEIGHT, WIDTH), 1e30)
-    depth[..., :4, :] = torch.inf
-    given = frame(light, depth=depth)
-    given.normal[..., :4, :] = 0
-    denoiser = Denoiser("svgf")
-    for number in range(5):
-        # Equal noise would be counted once.
-        image = denoiser(given.replace(color=given.color.roll(number, -1)))
-        assert image.isfinite().all()
-        assert image.min() >= 0
-
-
-def test_differentiable_through_time() -> None:
-    frames = [
-        frame(0.5 + torch.rand(1, 3, 2, 3, generator=torch.Generator().manual_seed(seed)).double()) for seed in range(2)
-    ]
-    model = Svgf(levels=1)
-
-    def last(first: Tensor) -> Tensor:
-        _, state = model(frames[0].replace(color=first))
-        return model(frames[1], state)[0].image
-
-    assert torch.autograd.gradcheck(last, (frames[0].color.requires_grad_(),))
-
-
-def test_has_no_weights_and_declares_its_needs() -> None:
-    model = create_model("svgf")
-    assert not list(model.parameters())
-    assert not model.needs.trainable
-    assert model.needs.buffers == {"color", "normal", "depth"}
-    for absent in ("normal", "depth"):
-        with pytest.raises(InputError, match=f"buffer '{absent}':"):
-            Denoiser("svgf")(frame().replace(**{absent: None}))
-    wrong = {"alpha": 0.0, "levels": 0, "sigma_z": 0.0, "sigma_n": 0.5, "sigma_l": -1.0}
-    for name, value in wrong.items():
-        with pytest.raises(InputError, match=rf"{name}: .*{value}"):
-            create_model("svgf", **{name: value})

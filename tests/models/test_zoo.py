@@ -1,0 +1,120 @@
+"""What holds for many methods, each in a row of a table: settings, sizes, states, and frames at the limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+from toys import refused, small, whole_frame
+
+from mcdenoise import Denoiser, create_model
+
+WRONG: dict[str, dict[str, Any]] = {
+    "accumulated": {"alpha_min": 0},
+    "asvgf": {"alpha": 0.0, "levels": 0, "gradient_levels": -1, "threshold": -1.0},
+    "bmfr": {"alpha_min": 0.0, "second_alpha": 2.0, "block": 1, "ridge": 0.0},
+    "cascaded": {"cascade": "K+K+K"},
+    "cascaded_v2": {"tolerance": -1},
+    "guided": {"radius": 0, "eps": torch.nan},
+    "joint_bilateral": {"sigma_color": 0, "sigma_space": torch.inf},
+    "kpcn": {"width": 0, "layers": 1, "kernel_size": 4},
+    "layered": {"width": 0, "convolutions": 0, "kernel_size": 4},
+    "mrkp": {"kernel_size": 2},
+    "nbgd": {"layers": 1},
+    "nppd": {"width": 0, "backbone": "resnet"},
+    "oidn": {"quality": "best", "auxiliary": "none", "source": "none", "threads": 0},
+    "oidn_temporal": {"auxiliary": "clean", "engine": "none", "prefilter": "none", "history": 0.0},
+    "sbmc": {"width": 0, "rounds": 0, "convolutions": 0, "kernel_size": 0},
+    "svgf": {"alpha": 0.0, "levels": 0, "sigma_z": 0.0, "sigma_n": 0.5, "sigma_l": -1.0},
+    "wskp": {"layers": 1},
+}
+
+
+@pytest.mark.parametrize(("name", "setting"), [(name, setting) for name, own in WRONG.items() for setting in own])
+def test_a_setting_out_of_its_range_is_refused(name: str, setting: str) -> None:
+    value = WRONG[name][setting]
+    message = refused(lambda: create_model(name, **{setting: value}))
+    assert f"{setting}: expected " in message
+    assert str(value) in message
+
+
+# The numbers of weights of the papers or of their public code, and of the default.
+SIZES = [
+    ("anf", {}, 190_432),
+    ("cascaded_v2", {}, 547_673),
+    ("kpcn", {"width": 100, "layers": 9, "kernel_size": 21}, 2 * 2_921_241),
+    ("mrkp", {}, 341_838),
+    ("nbgd", {"layers": 2}, 7_525),
+    ("nbgd", {}, 29_425),
+    ("nppd", {"width": 96}, 15_593_341),
+    ("nppd", {"width": 128, "backbone": "convunext"}, 33_446_525),
+    ("rae", {}, 1_521_529),
+]
+
+
+@pytest.mark.parametrize(("name", "settings", "expected"), SIZES, ids=lambda value: str(value))
+def test_the_number_of_weights(name: str, settings: dict[str, Any], expected: int) -> None:
+    with torch.device("meta"):
+        model = create_model(name, **settings)
+    assert sum(each.numel() for each in model.parameters()) == expected
+
+
+# Methods that keep something of the frame before, one of each kind.
+WITH_HISTORY = ["accumulated", "anf", "asvgf", "bmfr", "cascaded_v3_micro", "nppd", "oidn_tuned_small", "rae", "svgf"]
+
+
+@pytest.mark.parametrize("name", ["accumulated", "anf", "cascaded_v2_micro", "nppd", "oidn_tuned_small", "rae"])
+@torch.no_grad()
+def test_a_state_of_zeros_is_that_of_no_frame(name: str) -> None:
+    model = small(name)
+    first, second = (whole_frame(model, 17, 20, seed=seed) for seed in range(2))
+    zeros = pytree.tree_map_only(Tensor, torch.zeros_like, model(first)[1])
+    torch.testing.assert_close(model(second, zeros)[0].image, model(second)[0].image)
+
+
+@pytest.mark.parametrize("name", WITH_HISTORY)
+def test_another_size_and_frames_without_motion_begin_anew(name: str) -> None:
+    denoiser = Denoiser(small(name))
+    frames = [whole_frame(denoiser.model, *size, seed=seed) for seed, size in enumerate([(12, 15)] * 2 + [(9, 8)] * 2)]
+    lost = dict.fromkeys(("motion", "previous_position", "view_projection"))
+    for number, frame in enumerate((*frames[:3], frames[3].replace(**lost))):
+        image = denoiser(frame)
+        # What has no motion cannot see a cut, and what has no positions compares none.
+        if number == 1:
+            assert denoiser.report.reset == ""
+        elif number < 3:
+            assert denoiser.report.reset == ("first frame" if number == 0 else "size change")
+        if number == 2:
+            torch.testing.assert_close(image, Denoiser(denoiser.model)(frame))
+
+
+@pytest.mark.parametrize("name", ["asvgf", "bmfr", "guided", "joint_bilateral", "svgf"])
+def test_extremes_stay_finite(name: str) -> None:
+    denoiser = Denoiser(name)
+    frame = whole_frame(denoiser.model, 40, 36)
+    light, depth, normal = frame.color.clone(), torch.full_like(frame.color[:, :1], 1e30), frame.normal
+    assert normal is not None
+    light[..., ::5, ::7], light[..., ::3, ::4] = 1e16, 0
+    depth[..., :4, :], normal[..., :4, :] = torch.inf, 0
+    for number, factor in enumerate((1.0, 1e-12, 1.0, 0.0, 1e-30)):
+        # Equal noise would be counted once.
+        image = denoiser(frame.replace(color=light.roll(number, -1) * factor, depth=depth))
+        assert image.isfinite().all()
+        assert image.min() >= 0
+
+
+@pytest.mark.parametrize("name", ["anf", "layered", "nppd", "sbmc"])
+@torch.no_grad()
+def test_a_broken_sample_breaks_nothing(name: str) -> None:
+    denoiser = Denoiser(small(name))
+    frame = whole_frame(denoiser.model, 9, 8)
+    assert frame.samples is not None
+    for value in (torch.inf, -1.0, 1e30):
+        samples = frame.samples.clone()
+        samples[0, 1, 2, 3, 4] = value
+        image = denoiser(frame.replace(samples=samples))
+        assert image.isfinite().all()
+        assert image.min() >= 0
