@@ -130,7 +130,7 @@ def test_a_users_model_is_exported_with_its_wrappers(mine: str, tmp_path: Path) 
     assert exported.inputs == (
         *("color", "albedo", "normal", "depth", "motion"),
         *("state.color", "state.length", "state.surface.normal", "state.surface.depth"),
-        *("state.surface.label", "state.limit"),
+        *("state.surface.label", "state.limit", "state.light"),
     )
     assert exported.outputs[:2] == ("image", "next_state.color")
     step = Step(model, default_buffers(model))
