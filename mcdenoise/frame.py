@@ -1,100 +1,37 @@
-"""The buffers of a frame: names, layout, unit and range of everything that a renderer provides."""
+"""A frame: the buffers of one image, checked, and as a pytree."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError, did_you_mean, level_of_caller
-from mcdenoise.light import LARGEST_RADIANCE, Repairs, is_valid, repair, repairs_from
+from mcdenoise.arrays import of_array, unmasked
+from mcdenoise.buffers import (
+    BUFFERS,
+    LAYOUTS,
+    MATRIX,
+    MOTION,
+    RADIANCE,
+    BufferSpec,
+    Layout,
+    check_values,
+    clamped,
+    ordinary,
+    tells_motion,
+)
+from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.light import Repairs, is_valid, repair, repairs_from
 
-# Half floats and a renderer's own arithmetic may exceed a range by this.
-_ROUNDING = 1e-2
-
-
-@dataclass(frozen=True)
-class BufferSpec:
-    """Channels, range and meaning of a buffer.
-
-    Args:
-        channels: number of channels.
-        low: smallest legal value.
-        high: largest legal value.
-        meaning: unit and convention, for messages and documentation.
-        infinite: whether infinity is legal, within the range (nothing was hit, or there is no previous position).
-        slack: values may exceed ``high`` by this before they are rejected; they are clamped.
-        forgiven: whether larger values are also clamped, with a warning, if they are less than half of the buffer.
-    """
-
-    channels: int
-    low: float
-    high: float
-    meaning: str
-    infinite: bool = False
-    slack: float = _ROUNDING
-    forgiven: bool = False
-
-
-_UNBOUNDED = float("inf")
-_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-
-BUFFERS: dict[str, BufferSpec] = {
-    "color": BufferSpec(3, 0.0, _UNBOUNDED, "noisy radiance, scene-linear RGB, not clamped"),
-    "albedo": BufferSpec(
-        3, 0.0, 1.0, "diffuse reflectance, linear RGB; 0 where there is none", slack=1.0, forgiven=True
-    ),
-    "normal": BufferSpec(3, -1.0, 1.0, "shading normal, world space, unit length; 0 where nothing was hit"),
-    "depth": BufferSpec(
-        1, 0.0, _UNBOUNDED, "distance along the view axis, scene units; inf where nothing was hit", infinite=True
-    ),
-    "position": BufferSpec(3, -_UNBOUNDED, _UNBOUNDED, "world-space hit point, scene units"),
-    "motion": BufferSpec(
-        2, -_UNBOUNDED, _UNBOUNDED, "pixels, x right, y down: previous = current + motion", infinite=True
-    ),
-    "previous_position": BufferSpec(
-        3, -_UNBOUNDED, _UNBOUNDED, "where the surface point seen now was in the previous frame, world space"
-    ),
-    "diffuse": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by diffuse reflection, with albedo"),
-    "specular": BufferSpec(3, 0.0, LARGEST_RADIANCE, "noisy radiance by specular reflection"),
-    "specular_albedo": BufferSpec(3, 0.0, 1.0, "specular reflectance, linear RGB", slack=1.0, forgiven=True),
-    "roughness": BufferSpec(1, 0.0, 1.0, "perceptual roughness: 0 is a mirror"),
-    "emission": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance sent out by the surface itself, without noise"),
-    "variance": BufferSpec(3, 0.0, _UNBOUNDED, "variance of the mean that color is, of each channel"),
-    "alpha": BufferSpec(1, 0.0, 1.0, "coverage: 0 where only background is seen"),
-    "mask": BufferSpec(1, 0.0, 1.0, "validity: 0 where a pixel is void, such as a texel outside of all charts"),
-    "reference": BufferSpec(3, 0.0, LARGEST_RADIANCE, "converged radiance, scene-linear RGB"),
-    "current": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance of this frame alone, where color is accumulated"),
-    "length": BufferSpec(1, 0.0, _UNBOUNDED, "history length of an accumulated color, in frames"),
-}
-
-
-# Buffers of radiance, which scale with the light of a scene; the first three channels of samples also do.
-RADIANCE = ("color", "current", "diffuse", "specular", "emission")
-
-# Buffers that only tell where a pixel was in the previous frame: they are not needed without a history.
-MOTION = frozenset({"position", "motion", "previous_position"})
-
-
-def tells_motion(buffers: Collection[str]) -> bool:
-    """Whether these buffers tell where a pixel was in the previous frame: motion, or positions and cameras."""
-    return "motion" in buffers or {"position", "view_projection"} <= set(buffers)
-
-
-# Which axis of an array holds the channels.
-Layout: TypeAlias = Literal["HWC", "CHW"]
-LAYOUTS: tuple[Layout, ...] = ("HWC", "CHW")
-
-_MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
-_MATRIX_NAME = "view_projection"
-_ANYTHING = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "anything", infinite=True)
+# The vocabulary of buffers belongs to frames.
+__all__ = ["BUFFERS", "LAYOUTS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Inspected"]
+__all__ += ["Layout", "Skip", "Unread", "scale_samples", "tells_motion"]
 
 
 class Hints(NamedTuple):
@@ -219,12 +156,12 @@ class Frame:
     hints: Hints = _NO_HINTS
 
     def __post_init__(self) -> None:
-        _ordinary("buffer 'color'", self.color)
+        ordinary("buffer 'color'", self.color)
         if self.color.ndim != 4 or self.color.shape[1] != 3 or 0 in self.color.shape:
             raise InputError(f"buffer 'color': expected shape (B, 3, H, W), found {tuple(self.color.shape)}")
         batch, _, height, width = self.color.shape
         for name, value in self.items():
-            _ordinary(f"buffer '{name}'", value)
+            ordinary(f"buffer '{name}'", value)
             if value.device != self.color.device:
                 raise InputError(
                     f"buffer '{name}': expected on {self.color.device} like 'color', found on {value.device}"
@@ -284,20 +221,20 @@ class Frame:
                 f"buffer '{min(unknown)}': expected one of {', '.join(known)}; others go into extra={{...}}"
                 f"{near and '; '}{near}"
             )
-        color, valid = _unmasked(color, layout)
+        color, valid = unmasked(color, layout)
         if valid is not None:
             given_mask = buffers.get("mask")
             other = valid if given_mask is None else np.asarray(given_mask, np.float32).reshape(valid.shape)
             buffers["mask"] = np.minimum(valid, other)
-        image = _of_array("color", color, layout, None)
+        image = of_array("color", color, layout, None)
         size = (image.shape[2], image.shape[3])
         given: dict[str, Any] = {
-            name: _of_array(name, value, layout, size) for name, value in buffers.items() if value is not None
+            name: of_array(name, value, layout, size) for name, value in buffers.items() if value is not None
         }
         for name in extra or {}:
             if name in _NAMES:
                 raise InputError(f"extra: expected names that Frame does not know, found '{name}'; pass {name}=...")
-        others = {name: _of_array(name, value, layout, size) for name, value in (extra or {}).items()}
+        others = {name: of_array(name, value, layout, size) for name, value in (extra or {}).items()}
         return cls(color=image, **given, extra=others)
 
     @property
@@ -341,7 +278,7 @@ class Frame:
     def crop(self, rows: slice, columns: slice) -> Frame:
         """A rectangle of the frame, as views; its statistics stay those of the whole image, and nothing is skipped."""
         cropped: dict[str, Any] = {
-            name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != _MATRIX_NAME
+            name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != MATRIX
         }
         extra = {name: value[..., rows, columns] for name, value in self.extra.items()}
         layers = {name: value[..., rows, columns] for name, value in self.layers.items()}
@@ -391,7 +328,7 @@ class Frame:
             changes |= {"color": repaired.color, "layers": repaired.layers}
         for name, value in self.items():
             if name != "color":
-                clean, ranges[name] = _check_values(name, value)
+                clean, ranges[name] = check_values(name, value)
                 if clean is not value:
                     changes[name] = clean
         return Inspected(self.replace(**changes) if changes else self, repairs, ranges)
@@ -404,7 +341,20 @@ class Frame:
             have been read: it raises the errors of :meth:`validate`. The frame keeps values that would be rejected,
             except that they are clamped to their range.
         """
-        return _repaired(self)
+        repaired, layers = repair(self.color, self.layers, reads=False), list(self.layers)
+        others = {name: value for name, value in self.items() if name != "color"}
+        changes, numbers, judge_others = clamped(others)
+        of_light = len(repaired.numbers)
+
+        def judge(read: Sequence[float]) -> Repairs:
+            repairs = repairs_from(read[:of_light], layers)
+            judge_others(read[of_light:])
+            return repairs
+
+        # Created on the device, because copying a number from the host would wait.
+        numbers = [number.to(repaired.numbers.dtype)[None] for number in numbers]
+        frame = self.replace(color=repaired.color, layers=repaired.layers, **changes)
+        return Unread(frame, torch.cat([repaired.numbers, *numbers]), judge)
 
 
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
@@ -464,172 +414,12 @@ def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
     return torch.cat([samples[:, :, :3] * factor[:, None], samples[:, :, 3:]], 2)
 
 
-def _of_array(name: str, value: ArrayLike, layout: Layout, size: tuple[int, int] | None) -> Tensor:
-    """Convert an array to a buffer with a batch of one; ``size`` is that of color, and ``None`` for color itself."""
-    array = _floats(name, value)
-    if name == _MATRIX_NAME:
-        if array.shape != (4, 4):
-            raise InputError(f"buffer '{name}': expected shape (4, 4), found {array.shape}")
-        return torch.from_numpy(array)[None]
-    # Buffers outside the vocabulary, and samples, may have any number of channels.
-    wanted = BUFFERS[name].channels if name in BUFFERS else None
-    axis, axes = -1 if layout == "HWC" else -3, 4 if name == "samples" else 3
-    found = array.shape
-    if array.ndim == 2 and (wanted in (1, None) or name == "color"):
-        array = np.expand_dims(array, axis)
-    if name == "color" and array.ndim == axes and array.shape[axis] == 1:
-        array = np.repeat(array, 3, axis)
-    fits = array.ndim == axes and 0 not in array.shape and wanted in (None, array.shape[axis])
-    image = np.moveaxis(array, axis, -3) if fits else array
-    if not fits or image.shape[-2:] != (size or image.shape[-2:]):
-        height, width = size or ("H", "W")
-        expected = [height, width, wanted or "C"] if layout == "HWC" else [wanted or "C", height, width]
-        listed = ", ".join(str(each) for each in (["S", *expected] if name == "samples" else expected))
-        like = f"{' or ' + str(size) if wanted == 1 else ''} like 'color'" if size else ""
-        advice = "" if size else _advice(array, axis)
-        raise InputError(f"buffer '{name}': expected shape ({listed}){like}, found {found}{advice}")
-    return torch.from_numpy(image)[None]
-
-
-def _unmasked(color: ArrayLike, layout: Layout) -> tuple[ArrayLike, NDArray[np.float32] | None]:
-    """A color without numpy's mask, and the mask as a buffer ``(H, W)``: 0 where a channel is masked."""
-    if not isinstance(color, np.ma.MaskedArray):
-        return color, None
-    masked = np.ma.getmaskarray(color)
-    axis = -1 if layout == "HWC" else 0
-    return np.ma.getdata(color), 1 - np.asarray(masked.any(axis) if masked.ndim == 3 else masked).astype(np.float32)
-
-
-def _advice(color: NDArray[Any], axis: int) -> str:
-    """Advice for an array that has not the shape of a color."""
-    if color.ndim == 4:
-        return "; pass one image, or tensors (B, C, H, W) to Frame itself"
-    if color.ndim == 3 and color.shape[axis] == 4:
-        return "; pass its first three channels, and the fourth as alpha"
-    if color.ndim == 3 and color.shape[-4 - axis] == 3:
-        return f"; pass layout='{'CHW' if axis == -1 else 'HWC'}'"
-    return ""
-
-
-def _floats(name: str, value: ArrayLike) -> NDArray[Any]:
-    """An array of floats whose memory torch can share, or a copy."""
-    if isinstance(value, Tensor):
-        raise InputError(f"buffer '{name}': expected a numpy array, found a torch.Tensor; Frame itself takes tensors")
-    if np.ma.is_masked(value):
-        raise InputError(
-            f"buffer '{name}': expected a plain array, found a masked one; fill it, and pass mask= for void pixels"
-        )
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"buffer '{name}': expected an array, found {type(value).__name__}: {error}") from error
-    if array.dtype.kind != "f":
-        advice = "convert it with astype(numpy.float32)"
-        if array.dtype in (np.uint8, np.uint16):
-            advice = f"undo the encoding of a display first, about (x / {np.iinfo(array.dtype).max}) ** 2.2"
-        raise InputError(
-            f"buffer '{name}': expected a float dtype, as images are scene-linear floats, found {array.dtype}; {advice}"
-        )
-    if array.dtype.itemsize > 8:
-        array = array.astype(np.float64)
-    if not array.dtype.isnative:
-        array = array.astype(array.dtype.newbyteorder("="))
-    shared = array.flags.writeable and all(each >= 0 and each % array.itemsize == 0 for each in array.strides)
-    return array if shared else array.copy()
-
-
 def _check_layer(name: str, layer: object, color: Tensor) -> None:
-    layer = _ordinary(f"layer '{name}'", layer)
+    layer = ordinary(f"layer '{name}'", layer)
     if layer.shape != color.shape or layer.device != color.device:
         raise InputError(
             f"layer '{name}': expected shape {tuple(color.shape)} on {color.device} like 'color', found "
             f"{tuple(layer.shape)} on {layer.device}"
-        )
-
-
-# What torch itself makes of tensors while it records a graph or differentiates.
-_OF_TORCH = ("torch._subclasses", "torch._functorch", "torch._C", "torch.fx", "torch.nn.parameter")
-
-
-def _ordinary(what: str, value: object) -> Tensor:
-    """A dense tensor of a float dtype with which all of torch computes; anything else is refused in one line."""
-    if not isinstance(value, Tensor):
-        raise InputError(f"{what}: expected a torch.Tensor, found {type(value).__name__}")
-    if type(value) is not Tensor and not type(value).__module__.startswith(_OF_TORCH):
-        found, advice = f"its subclass {type(value).__name__}", "pass as_subclass(torch.Tensor) of it"
-    elif value.is_nested or value.layout != torch.strided:
-        found, advice = "a nested one" if value.is_nested else f"one of {value.layout}", "pass to_dense() of it"
-    # A graph of torch.compile cannot ask.
-    elif not torch.compiler.is_compiling() and value.is_neg():
-        found, advice = "a view with the negative bit", "pass resolve_neg() of it"
-    elif value.dtype not in _FLOATS:
-        expected = "a floating-point dtype" + ("" if not value.is_floating_point() else " of 16, 32 or 64 bits")
-        raise InputError(f"{what}: expected {expected}, found {value.dtype}")
-    else:
-        return value
-    raise InputError(f"{what}: expected an ordinary torch.Tensor, found {found}; {advice}")
-
-
-def _check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
-    """The clamped values, and their minimum and maximum."""
-    spec = _spec_of(name)
-    low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
-    # NaN propagates through minimum and maximum and fails the comparison; only then is every value checked again.
-    if not -_UNBOUNDED < low <= high < _UNBOUNDED and (bad := _illegal(spec, value)).any():
-        where = bad.nonzero()[0].tolist()
-        place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
-        _refuse_illegal(name, int(bad.sum()), f", {place}")
-    if low >= spec.low and high <= spec.high:
-        return value, (low, high)
-    _refuse_range(name, low, high, float(_above(spec, value)) if high > _limit(spec) else 0.0)
-    return value.clamp(spec.low, spec.high), (max(low, spec.low), min(high, spec.high))
-
-
-def _spec_of(name: str) -> BufferSpec:
-    return _MATRIX if name == _MATRIX_NAME else BUFFERS.get(name, _ANYTHING)
-
-
-def _limit(spec: BufferSpec) -> float:
-    """Values up to this are clamped; it includes the rounding of the largest radiance."""
-    return spec.high + max(spec.slack, 1e-6 * spec.high)
-
-
-def _above(spec: BufferSpec, value: Tensor) -> Tensor:
-    """The fraction of values above the limit."""
-    return (value > _limit(spec)).double().mean()
-
-
-def _illegal(spec: BufferSpec, value: Tensor) -> Tensor:
-    if spec.infinite:
-        return torch.isnan(value) | ((value == -_UNBOUNDED) & (spec.low != -_UNBOUNDED))
-    return ~torch.isfinite(value)
-
-
-def _refuse_illegal(name: str, count: int, place: str = "") -> None:
-    spec = _spec_of(name)
-    expected = "finite values or inf" if spec.infinite else "finite values"
-    advice = "set them to inf where there is none" if spec.infinite else "render the buffer again"
-    raise InputError(
-        f"buffer '{name}': expected {expected} ({spec.meaning}), "
-        f"found {count} NaN or infinite ones{place}; {advice}, or leave the buffer out"
-    )
-
-
-def _refuse_range(name: str, low: float, high: float, above: float) -> None:
-    """Reject a range, or warn if the fraction ``above`` the limit is small enough to be clamped."""
-    spec = _spec_of(name)
-    # Single large reflectances are the fault of a pixel; if most are large, the buffer has another unit or content.
-    forgiven = high > _limit(spec) and spec.forgiven and above < 0.5
-    if forgiven:
-        warnings.warn(
-            f"buffer '{name}': expected values up to {spec.high:g} ({spec.meaning}), found some up to {high:.4g}, "
-            f"which count as {spec.high:g}; leave the buffer out if it is another one",
-            stacklevel=level_of_caller(),
-        )
-    if low < spec.low - _ROUNDING or (high > _limit(spec) and not forgiven):
-        raise InputError(
-            f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}] ({spec.meaning}), "
-            f"found [{low:.4g}, {high:.4g}]"
         )
 
 
@@ -648,34 +438,3 @@ class Unread(NamedTuple):
     frame: Frame
     numbers: Tensor
     judge: Callable[[Sequence[float]], Repairs]
-
-
-def _repaired(frame: Frame) -> Unread:
-    """See :meth:`Frame.repaired`."""
-    repaired, layers = repair(frame.color, frame.layers, reads=False), list(frame.layers)
-    of_light = len(repaired.numbers)
-    numbers: list[Tensor] = []
-    changes: dict[str, Any] = {"color": repaired.color, "layers": repaired.layers}
-    names = [name for name, _ in frame.items() if name != "color"]
-    for name in names:
-        value = frame.buffer(name)
-        assert value is not None
-        spec = _spec_of(name)
-        seen = value.detach()
-        numbers += [*torch.aminmax(seen), _illegal(spec, seen).sum(), _above(spec, seen)]
-        if spec.high != _UNBOUNDED or spec.low != -_UNBOUNDED:
-            changes[name] = value.clamp(spec.low, spec.high)
-
-    def judge(read: Sequence[float]) -> Repairs:
-        repairs, found = repairs_from(read[:of_light], layers), iter(read[of_light:])
-        for name in names:
-            low, high, illegal, above = (next(found) for _ in range(4))
-            if illegal:
-                _refuse_illegal(name, int(illegal))
-            if low < _spec_of(name).low or high > _spec_of(name).high:
-                _refuse_range(name, low, high, above)
-        return repairs
-
-    # Created on the device, because copying a number from the host would wait.
-    others = [number.to(repaired.numbers.dtype)[None] for number in numbers]
-    return Unread(frame.replace(**changes), torch.cat([repaired.numbers, *others]), judge)

@@ -22,7 +22,7 @@ class FromBuffers(nn.Module):
 
     Args:
         function: takes ``(B, C, H, W)`` tensors. The names of its parameters are the names of the buffers that it gets:
-            those of :data:`mcdenoise.frame.BUFFERS` or keys of ``Frame.extra``. A parameter with a default value is
+            those of :data:`mcdenoise.buffers.BUFFERS` or keys of ``Frame.extra``. A parameter with a default value is
             optional: it gets the buffer only if the frame has it. The function returns ``(B, 3, H, W)`` radiance or an
             :class:`mcdenoise.models.Output`.
         reach: see :class:`mcdenoise.models.Needs`.

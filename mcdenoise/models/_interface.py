@@ -82,7 +82,7 @@ class Needs:
     """The requirements of a method for its frames and its host.
 
     Args:
-        buffers: names of the required buffers, see :data:`mcdenoise.frame.BUFFERS`.
+        buffers: names of the required buffers, see :data:`mcdenoise.buffers.BUFFERS`.
         uses: names of optional buffers that improve the result.
         trainable: whether the method has weights to train; False for filters without weights, for third-party
             denoisers, and for networks that come with their weights.
