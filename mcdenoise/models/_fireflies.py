@@ -58,16 +58,24 @@ def _moved(image: Tensor, motion: Tensor | None, batch: Tensor, rows: Tensor, co
     A light of one pixel that moves by a third of a pixel stays in its pixel twice, and then is in the next one.
     """
     if motion is None:
-        return image[batch, 0, rows, columns]
+        return _at(image[:, 0], batch, rows, columns)
     height, width = image.shape[2:]
-    x, y = (motion[batch, axis, rows, columns].to(torch.promote_types(motion.dtype, torch.float32)) for axis in (0, 1))
-    x, y = columns + x.nan_to_num(torch.inf), rows + y.nan_to_num(torch.inf)
+    motion = motion.to(torch.promote_types(motion.dtype, torch.float32))
+    x, y = (_at(motion[:, axis], batch, rows, columns).nan_to_num(torch.inf) for axis in (0, 1))
+    x, y = columns + x, rows + y
     found = torch.zeros_like(x, dtype=image.dtype)
     for row, column in itertools.product((y.floor(), y.ceil()), (x.floor(), x.ceil())):
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        there = image[batch, 0, torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long()]
-        found = torch.where(inside, torch.maximum(found, there), found)
+        place = (torch.where(inside, each, 0).long() for each in (row, column))
+        found = torch.where(inside, torch.maximum(found, _at(image[:, 0], batch, *place)), found)
     return found
+
+
+def _at(image: Tensor, batch: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """Pixels of images ``(B, H, W)``; graphs in ONNX have no other way for images of any size."""
+    height, width = image.shape[1:]
+    place = (batch * height + rows) * width + columns
+    return image.flatten().index_select(0, place.flatten()).reshape(place.shape)
 
 
 def light_of(color: Tensor) -> Tensor:
