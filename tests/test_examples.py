@@ -507,3 +507,40 @@ def test_a_frame_is_augmented_with_all_its_buffers() -> None:
         expected = image.flip(-1) * (sign if name == "motion" else 1)
         torch.testing.assert_close(getattr(moved, name), expected, rtol=0, atol=0)
     assert names["preview"](4)(images["color"]).shape == (2, 3, 4, 4)
+
+
+@pytest.mark.slow
+def test_every_part_of_the_first_run_on_a_gpu_runs_on_a_processor(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba", reason="one part renders with Mitsuba")
+    run("gpu/run_all.py", "-o", tmp_path, "--device", "cpu", "--quick", alone=True)
+    ends = json.loads((tmp_path / "summary.json").read_text())
+    assert {each["part"] for each in ends} == {"about", "ops", "models", "training", "mitsuba_loop"}
+    rows = [row for each in ends for row in json.loads((tmp_path / f"{each['part']}.json").read_text())]
+    assert not [row for row in rows if "failed" in row]
+    assert all(max(row["differences"]) < 1e-6 for row in rows if "differences" in row)
+
+
+def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
+    (tmp_path / "ops.json").mkdir()
+    command = [sys.executable, EXAMPLES / "gpu" / "run_all.py", "-o", tmp_path, "--device", "cpu", "--quick"]
+    done = subprocess.run([*command, "--parts", "ops", "about"], capture_output=True, text=True, timeout=SECONDS)
+    assert done.returncode == 1
+    ends = {each["part"]: each["ended"] for each in json.loads((tmp_path / "summary.json").read_text())}
+    assert ends["about"] == "done"
+    assert "failed" in ends["ops"]
+
+
+@pytest.mark.slow
+def test_training_for_minutes_ends_with_weights_and_goes_on(small_sequence: Path, tmp_path: Path) -> None:
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(
+        '[train]\nmodel = "cascaded_v2_micro"\nbatch = 1\nframes = 2\ncrop = 16\nvalidation_frames = 0\n'
+        '[[data]]\nseeds = "0"\n'
+    )
+    arguments = (small_sequence, "-o", tmp_path / "out", "--recipe", recipe, "--minutes", "0.5", "--device", "cpu")
+    first, *_, weights = run("gpu/train.py", *arguments, alone=True).splitlines()
+    assert int(first.split()[0]) >= 1
+    assert create_model("cascaded_v2_micro", weights=Path(weights)) is not None
+    assert (tmp_path / "out" / "run" / "checkpoint.pt").exists()
+    # It is done already.
+    assert run("gpu/train.py", *arguments, alone=True).splitlines() == [first, weights]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import torch
@@ -85,7 +86,7 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
     model = _without_history(whole)
     if not isinstance(model, nn.Module) or not whole.needs.trainable or model(CASES[0].frame())[1] is not None:
         return
-    exact = copy.deepcopy(model).double()
+    exact = _Exact(copy.deepcopy(model).double())
     for dtype in dtypes:
         for case in CASES:
             yield from _check_case(name, model, exact, case, dtype)
@@ -105,7 +106,7 @@ def _image(model: nn.Module, frame: Frame) -> Tensor:
     return image
 
 
-def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
+def _check_case(name: str, model: nn.Module, exact: _Exact, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
     """Check that image and gradients are finite, and compare the image with float64."""
     frame = case.frame()
     color = frame.color.clone().requires_grad_()
@@ -130,7 +131,7 @@ def _check_case(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, 
 
 
 @torch.no_grad()
-def _check_exposure(name: str, model: nn.Module, exact: nn.Module, case: ModelCase, dtype: torch.dtype) -> Check:
+def _check_exposure(name: str, model: nn.Module, exact: _Exact, case: ModelCase, dtype: torch.dtype) -> Check:
     """``model(s x) = s model(x)``, for the factor ``s`` with the largest error."""
     frame = case.frame()
     checks: list[Check] = []
@@ -142,64 +143,103 @@ def _check_exposure(name: str, model: nn.Module, exact: nn.Module, case: ModelCa
     return max(checks, key=lambda check: check.error)
 
 
-def _compared(name: str, exact: nn.Module, case: ModelCase, dtype: torch.dtype, what: str, found: Tensor) -> Check:
-    frame = case.frame().to(torch.float64)
-    expected = _image(exact, frame)
+def _compared(name: str, exact: _Exact, case: ModelCase, dtype: torch.dtype, what: str, found: Tensor) -> Check:
     unit = torch.finfo(dtype).eps / 2
-    products = max(relative_change(_moved(exact, frame, unit, seed), expected) for seed in range(_DRAWS))
-    sums = max(relative_change(_summed(exact, frame, seed), expected) for seed in range(_DRAWS))
     # Everything except convolutions is in float32.
-    response = ROUNDED * max(products, torch.finfo(torch.float32).eps) + sums
-    error, allowed = relative_change(found, expected) / (2 * unit), ALLOWED * response / (2 * unit)
+    response = ROUNDED * max(exact.products(case, unit), torch.finfo(torch.float32).eps) + exact.sums(case)
+    error, allowed = relative_change(found, exact.image(case)) / (2 * unit), ALLOWED * response / (2 * unit)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
     return Check(name, case.name, name_of(dtype), "", what, error, allowed, response / unit, not message, message)
 
 
-def _moved(exact: nn.Module, frame: Frame, unit: float, seed: int) -> Tensor:
-    """The image when every weight and buffer changes by ``unit`` relatively, up or down."""
-    generator = torch.Generator().manual_seed(seed)
+class _Exact:
+    """A model in float64: its images, and how much they change when the model rounds; each is computed once.
 
-    def move(tensor: Tensor) -> Tensor:
-        signs = torch.randint(0, 2, tensor.shape, generator=generator) * 2 - 1
-        return tensor * (1 + unit * signs)
-
-    weights = {name: move(parameter) for name, parameter in exact.named_parameters()}
-    output, _ = torch.func.functional_call(exact, weights, (frame.map(move),))
-    image: Tensor = output.image
-    return image
-
-
-def _summed(exact: nn.Module, frame: Frame, seed: int) -> Tensor:
-    """The image when the result of every convolution changes by the rounding error of a float32 sum of n products.
-
-    The k-th partial sum of products with random signs has the size of sqrt(k) products, and a relative rounding error
-    of ``u``. The rounding errors of all partial sums add up to ``u n / sqrt(2)`` of a product, which is
-    ``u sqrt(n / 2)`` times the root of the sum of squared products (Higham, Accuracy and Stability of Numerical
-    Algorithms, 2002, Sec. 2.8 and 4.2).
+    Args:
+        model: in float64.
     """
-    generator = torch.Generator().manual_seed(seed)
-    unit = torch.finfo(torch.float32).eps / 2
 
-    def change(layer: nn.Module, given: tuple[Any, ...], result: Tensor) -> Tensor:
-        assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-        squared = copy.deepcopy(layer)
-        for parameter in squared.parameters():
-            parameter.square_()
-        # Calling the module instead would run this hook again.
-        spread = squared.forward(given[0].square(), *given[1:]).sqrt()
-        signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
-        terms = layer.weight.numel() / layer.out_channels
-        if isinstance(layer, nn.ConvTranspose2d):
-            terms /= math.prod(layer.stride)
-        return result + unit * math.sqrt(terms / 2) * spread * signs
+    def __init__(self, model: nn.Module) -> None:
+        self.model = model
+        self._squared = {
+            each: _with_squared_weights(each)
+            for each in model.modules()
+            if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)
+        }
+        self._known: dict[tuple[str, float], Any] = {}
 
-    convolutions = [each for each in exact.modules() if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)]
-    handles = [each.register_forward_hook(change) for each in convolutions]
-    try:
-        return _image(exact, frame)
-    finally:
-        for handle in handles:
-            handle.remove()
+    def _once(self, case: ModelCase, unit: float, compute: Callable[[Frame], Any]) -> Any:
+        key = case.name, unit
+        if key not in self._known:
+            self._known[key] = compute(case.frame().to(torch.float64))
+        return self._known[key]
+
+    def image(self, case: ModelCase) -> Tensor:
+        """The image of a case."""
+        image: Tensor = self._once(case, 0.0, partial(_image, self.model))
+        return image
+
+    def products(self, case: ModelCase, unit: float) -> float:
+        """The largest change of the image when every weight and buffer changes by ``unit`` relatively, up or down."""
+
+        def change(frame: Frame) -> float:
+            return max(relative_change(self._moved(frame, unit, seed), self.image(case)) for seed in range(_DRAWS))
+
+        return float(self._once(case, unit, change))
+
+    def sums(self, case: ModelCase) -> float:
+        """The largest change of the image when convolutions are summed in float32."""
+
+        def change(frame: Frame) -> float:
+            return max(relative_change(self._summed(frame, seed), self.image(case)) for seed in range(_DRAWS))
+
+        return float(self._once(case, -1.0, change))
+
+    def _moved(self, frame: Frame, unit: float, seed: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+
+        def move(tensor: Tensor) -> Tensor:
+            signs = torch.randint(0, 2, tensor.shape, generator=generator) * 2 - 1
+            return tensor * (1 + unit * signs)
+
+        weights = {name: move(parameter) for name, parameter in self.model.named_parameters()}
+        output, _ = torch.func.functional_call(self.model, weights, (frame.map(move),))
+        image: Tensor = output.image
+        return image
+
+    def _summed(self, frame: Frame, seed: int) -> Tensor:
+        """The image when the result of every convolution changes by the rounding error of a float32 sum of n products.
+
+        The k-th partial sum of products with random signs has the size of sqrt(k) products, and a relative rounding
+        error of ``u``. The rounding errors of all partial sums add up to ``u n / sqrt(2)`` of a product, which is
+        ``u sqrt(n / 2)`` times the root of the sum of squared products (Higham, Accuracy and Stability of Numerical
+        Algorithms, 2002, Sec. 2.8 and 4.2).
+        """
+        generator = torch.Generator().manual_seed(seed)
+        unit = torch.finfo(torch.float32).eps / 2
+
+        def change(layer: nn.Module, given: tuple[Any, ...], result: Tensor) -> Tensor:
+            assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
+            spread = self._squared[layer](given[0].square(), *given[1:]).sqrt()
+            signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
+            terms = layer.weight.numel() / layer.out_channels
+            if isinstance(layer, nn.ConvTranspose2d):
+                terms /= math.prod(layer.stride)
+            return result + unit * math.sqrt(terms / 2) * spread * signs
+
+        handles = [layer.register_forward_hook(change) for layer in self._squared]
+        try:
+            return _image(self.model, frame)
+        finally:
+            for handle in handles:
+                handle.remove()
+
+
+def _with_squared_weights(layer: nn.Module) -> nn.Module:
+    squared = copy.deepcopy(layer).requires_grad_(False)
+    for parameter in squared.parameters():
+        parameter.square_()
+    return squared
 
 
 def relative_change(found: Tensor, expected: Tensor) -> float:
