@@ -31,7 +31,7 @@ format: $(VENV)/.stamp-dev ## mend style and format where that is safe
 	$(BIN)/ruff format
 
 clean: ## remove .venv, caches and everything written by make
-	rm -rf $(VENV) demo build dist *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # One stamp for each set of extras, so that a second run installs nothing.

@@ -1,18 +1,19 @@
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from small import small_model
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.color_space import import_colour
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.frame import Frame
+from mcdenoise.models import save_weights
 
 HEIGHT, WIDTH, FRAMES = 20, 24, 4
 
@@ -43,10 +44,29 @@ def colour() -> Any:
     return import_colour()
 
 
+torch.set_num_threads(1)
+
+
 @pytest.fixture(autouse=True)
-def seed() -> None:
-    """A test that draws numbers draws the same ones each time, whatever ran before it."""
+def seed() -> Iterator[None]:
+    """A test draws the same numbers each time, on one thread, whatever ran before it."""
     torch.manual_seed(0)
+    yield
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A folder to write to, which is not there yet."""
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """A file of the weights of a small model."""
+    path = tmp_path / "small.safetensors"
+    path.write_bytes(save_weights(small_model(), "cascaded_v2", {"width": 8}, {}))
+    return path
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Planes, the simplest surfaces: their features are known at every point of a pixel."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

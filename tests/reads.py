@@ -1,7 +1,5 @@
 """Steps on a processor that read no values, as on a GPU."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

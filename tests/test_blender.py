@@ -1,7 +1,5 @@
 """The add-on for Blender, where there is a Blender: the variable BLENDER_PYTHON names an interpreter with `bpy`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,14 +1,8 @@
 """Many methods, settings and scenes in short: means, the best settings, and who is ahead."""
 
-from __future__ import annotations
-
-from dataclasses import replace
-
 import pytest
 
-from mcdenoise.benchmark import Score, folded, mean_over_scenes, scores_of, summary, verdicts
-from mcdenoise.evaluate import METRICS
-from mcdenoise.results import Cell, Machine, Method, Results, Scene
+from mcdenoise.benchmark import Score, folded, summary, verdicts
 
 
 def by_method(scores: list[Score]) -> dict[str, Score]:
@@ -51,18 +45,6 @@ def test_settings_fold_to_the_best_of_each_metric(two_scenes: list[Score]) -> No
     assert one["ours"].values == {"SMAPE": 0.09, "PSNR": 29}
 
 
-def test_every_scene_counts_the_same(two_scenes: list[Score]) -> None:
-    longer = [replace(s, frames=98) if s.scene == "two" else s for s in two_scenes]
-    means = by_method(mean_over_scenes(longer))
-    assert means["A"].values == pytest.approx({"SMAPE": 0.2, "PSNR": 20})
-    assert (means["A"].scene, means["A"].frames) == ("mean of 2", 100)
-
-
-def test_a_metric_that_one_scene_lacks_has_no_mean(two_scenes: list[Score]) -> None:
-    two_scenes[0].values["tRMSE"] = 0.5
-    assert set(by_method(mean_over_scenes(two_scenes))["noisy"].values) == {"SMAPE", "PSNR"}
-
-
 def test_summary_tells_one_setting_for_all_from_one_for_each(two_scenes: list[Score]) -> None:
     rows = by_method(summary(two_scenes, ("quality",)))
     best, of_each = "oidn, best of 4 settings", "oidn, best of each scene"
@@ -88,40 +70,3 @@ def test_verdicts(two_scenes: list[Score]) -> None:
     assert psnr.ahead
     assert psnr.won == ["two"]
     assert "+2; its best setting of each scene 28: +2; better in 1 of 2 scenes, not in one" in str(psnr)
-
-
-def test_a_worse_model_is_not_ahead(two_scenes: list[Score]) -> None:
-    smape, psnr = verdicts(two_scenes, "noisy")
-    assert not smape.ahead
-    assert not psnr.ahead
-    assert smape.won == psnr.won == []
-    # As good is not better.
-    assert not METRICS["SMAPE"].better(0.1, 0.1)
-    with pytest.raises(ValueError, match="'ours' and of 'joint_bilateral'"):
-        verdicts(two_scenes, "ours", "joint_bilateral")
-
-
-def test_scores_are_those_of_the_cells() -> None:
-    methods = [
-        Method("noisy", "baseline", "noisy", "noisy"),
-        Method("ours", "trainable", "ours", "ours", {"width": 4}),
-        Method("theirs(a=1)", "fixed", "1", "theirs", {"a": 1}),
-        Method("theirs(a=2)", "fixed", "2", "theirs", {"a": 2}),
-        Method("absent", "fixed", "absent", "absent", missing="not installed"),
-    ]
-    cells = [
-        Cell("one", "noisy", {"SMAPE": 0.5}),
-        Cell("one", "ours", {"SMAPE": 0.1}, on_the_way={"initial": {"SMAPE": 0.2}}),
-        Cell("one", "theirs(a=1)", {"SMAPE": 0.3}, on_the_way={"initial": {"SMAPE": 0.4}}),
-        Cell("one", "theirs(a=2)", failure="it broke"),
-    ]
-    scene = Scene("one", 8, 8, [0, 1, 2], [1, 2])
-    scores = scores_of(Results("", "", Machine("", 1, 1.0, "cpu", 1, ""), 0, [scene], methods, cells))
-    assert [(score.method, score.values["SMAPE"], score.family) for score in scores] == [
-        ("noisy", 0.5, ""),
-        ("ours, initial", 0.2, ""),
-        # One setting alone is no sweep.
-        ("ours", 0.1, ""),
-        ("theirs(a=1)", 0.3, "theirs"),
-    ]
-    assert {score.frames for score in scores} == {2}

@@ -1,7 +1,5 @@
 """The default model, by the features and the noise of a frame."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,15 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import succeeds
 from planes import plane
 
 from mcdenoise import Denoiser, InputError, denoise
-from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.denoiser import suitable_model
 from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
-from mcdenoise.models._weights import find_weights
 from mcdenoise.shot import ShotSettings, default_model
 
 LITTLE_NOISE = (
@@ -70,14 +67,9 @@ def test_settings_that_only_a_cascade_has_choose_one(small_sequence: Path) -> No
         chosen.denoiser()
 
 
-def test_the_command_says_what_it_picked(
-    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_says_what_it_picked(small_sequence: Path, tmp_path: Path) -> None:
     def printed(*options: str) -> str:
-        with pytest.raises(SystemExit) as stop:
-            main(["denoise", str(small_sequence), "-o", str(tmp_path / str(len(options))), *options])
-        assert stop.value.code in (0, None)
-        return capsys.readouterr().out
+        return succeeds("denoise", small_sequence, "-o", tmp_path / str(len(options)), *options)
 
     def report(folder: str) -> dict[str, Any]:
         return json.loads((tmp_path / folder / "denoise.json").read_text())
@@ -88,9 +80,8 @@ def test_the_command_says_what_it_picked(
     assert "picked" not in printed("--model", "joint_bilateral")
     assert report("2")["picked"] == ""
     # The model is also known before denoising.
-    with pytest.raises(SystemExit):
-        main(["inspect", str(small_sequence), "--json", str(tmp_path / "inspect.json")])
-    assert f"`mcdenoise denoise` picks {picked}\n" in capsys.readouterr().out
+    inspected = succeeds("inspect", small_sequence, "--json", tmp_path / "inspect.json")
+    assert f"`mcdenoise denoise` picks {picked}\n" in inspected
     assert json.loads((tmp_path / "inspect.json").read_text())["picked"] == picked
 
 
@@ -162,7 +153,3 @@ def test_a_picked_model_obeys_the_arguments_of_the_denoiser() -> None:
     with pytest.raises(InputError):
         denoiser(frame.replace(depth=torch.full_like(frame.color[:, :1], torch.nan)))
     assert denoiser.model is None
-
-
-def test_weights_bring_their_model() -> None:
-    assert Denoiser(weights=find_weights("cascaded_v2_micro"))._name == "cascaded_v2_micro"

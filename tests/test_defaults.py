@@ -1,14 +1,13 @@
 """Whatever torch's default dtype and device are in a program, what is computed is the same, bit for bit."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, InputError, list_models, ops
@@ -152,16 +151,9 @@ WRONG: list[dict[str, Any]] = [
 ]
 
 
-def told(action: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as error:
-        action()
-    assert "\n" not in str(error.value)
-    return str(error.value)
-
-
 @pytest.mark.parametrize("wrong", WRONG, ids=str)
 def test_an_argument_of_another_kind_is_told_by_its_name(wrong: dict[str, Any]) -> None:
-    message = told(lambda: Denoiser(**{"model": "cascaded_v2_micro", **wrong}))
+    message = refused(lambda: Denoiser(**{"model": "cascaded_v2_micro", **wrong}))
     assert next(iter(wrong)) in message or str(next(iter(wrong.values()))) in message
 
 
@@ -169,11 +161,11 @@ def test_an_argument_of_another_kind_is_told_by_its_name(wrong: dict[str, Any]) 
 def test_objects_that_are_no_frame_are_named(given: Any) -> None:
     denoiser = Denoiser("noisy")
     for call in (denoiser, denoiser.output):
-        assert told(lambda call=call: call(given)).startswith(
+        assert refused(lambda call=call: call(given)).startswith(
             "frame: expected a Frame, such as Frame(color=...), found "
         )
 
 
 @pytest.mark.parametrize("wrong", [{"frames": "3"}, {"frames": True}, {"layers": "x"}, {"layers": None}], ids=str)
 def test_invalid_options_of_a_shot_are_named(wrong: dict[str, Any]) -> None:
-    assert told(lambda: Denoiser("noisy").reset(**wrong)).startswith(f"{next(iter(wrong))}: expected a whole number")
+    assert refused(lambda: Denoiser("noisy").reset(**wrong)).startswith(f"{next(iter(wrong))}: expected a whole number")

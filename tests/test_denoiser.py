@@ -1,7 +1,5 @@
 """Streaming frames through a denoiser, and whole sequences to files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -9,45 +7,20 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import refused
+from small import small_model
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.data import open_sequence
-from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, Stage, Tiled, parts_of, save_weights
-from mcdenoise.models.cascaded_v2 import PixelNetwork
-
-STAGES = ["validate", "restore", "accumulate", "plan", "network", "Chain"]
-
-
-def small_model() -> nn.Module:
-    """A small cascade with random weights, also in the heads that start at zero."""
-    torch.manual_seed(0)
-    model = create_model("cascaded_v2", width=8)
-    assert isinstance(model, nn.Module)
-    for head in next(parts_of(model, PixelNetwork)).heads:
-        nn.init.normal_(head.weight, std=0.02)
-    return model
-
-
-@pytest.fixture
-def weights(tmp_path: Path) -> Path:
-    path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(small_model(), "cascaded_v2", {"width": 8}, {}))
-    return path
+from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, parts_of
 
 
 @pytest.fixture
 def frames(small_sequence: Path) -> list[Frame]:
     sequence = open_sequence(small_sequence)
     return [sequence.frame(number) for number in sequence.numbers]
-
-
-def refused(action: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as error:
-        action()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 class Keep(nn.Module):
@@ -74,39 +47,6 @@ class Mean(nn.Module):
         total, count = (0 * frame.color, 0 * frame.color[:, :1]) if state is None else (state["total"], state["count"])
         state = {"total": total + frame.color, "count": count + 1}
         return Output(state["total"] / state["count"]), state
-
-
-def test_a_shot_is_streamed(frames: list[Frame]) -> None:
-    denoiser = Denoiser(small_model())
-    for i, frame in enumerate(frames):
-        image = denoiser(frame)
-        assert image.shape == frame.color.shape
-        assert image.dtype == torch.float32
-        assert torch.isfinite(image).all()
-        report = denoiser.report
-        assert list(report.milliseconds) == STAGES
-        assert all(value >= 0 for value in report.milliseconds.values())
-        assert report.reset == ("" if i else "first frame")
-        assert (report.replaced_pixels, report.missing) == (0, [])
-
-
-def test_the_same_frames_give_the_same_images(frames: list[Frame]) -> None:
-    denoiser = Denoiser(small_model())
-    first = [denoiser(frame) for frame in frames]
-    denoiser.reset()
-    again = [denoiser(frame) for frame in frames]
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
-
-
-def test_the_history_matters_until_it_is_reset(frames: list[Frame]) -> None:
-    denoiser = Denoiser(small_model())
-    alone = denoiser(frames[1])
-    denoiser.reset()
-    denoiser(frames[0])
-    with_past = denoiser(frames[1])
-    assert not torch.equal(with_past, alone)
-    denoiser.reset()
-    assert torch.equal(denoiser(frames[1]), alone)
 
 
 def test_a_module_of_your_own(frames: list[Frame]) -> None:
@@ -190,30 +130,6 @@ def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: 
     assert torch.equal(denoiser(frames[1]), after)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_frames_of_any_precision(dtype: torch.dtype) -> None:
-    torch.manual_seed(0)
-    frame = Frame(color=torch.rand(1, 3, 9, 7).to(dtype), depth=torch.ones(1, 1, 9, 7).to(dtype))
-    denoiser = Denoiser(small_model())
-    image = denoiser(frame)
-    denoiser.reset()
-    assert image.dtype == torch.float32
-    assert torch.equal(image, denoiser(frame.to(torch.float32)))
-
-
-def test_images_of_a_batch_are_denoised_alike(frames: list[Frame]) -> None:
-    def pair(first: Frame, second: Frame) -> Frame:
-        return Frame(**{name: torch.cat([value, getattr(second, name)]) for name, value in first.items()})
-
-    both = Denoiser(small_model())
-    both(pair(frames[0], frames[2]))
-    together = both(pair(frames[1], frames[3]))
-    for i, (before, frame) in enumerate(((frames[0], frames[1]), (frames[2], frames[3]))):
-        one = Denoiser(small_model())
-        one(before)
-        torch.testing.assert_close(together[i : i + 1], one(frame), rtol=1e-4, atol=1e-5)
-
-
 def test_a_change_of_size_starts_a_new_shot(frames: list[Frame]) -> None:
     denoiser = Denoiser(small_model())
     denoiser(frames[0])
@@ -227,31 +143,7 @@ def test_a_device_that_is_not_there(device: str) -> None:
     assert f"device '{device}': expected one that torch can use" in refused(lambda: Denoiser(Keep(), device=device))
 
 
-def test_models_by_name(weights: Path, frames: list[Frame]) -> None:
-    by_name, by_module = Denoiser("cascaded_v2", weights=weights), Denoiser(small_model())
-    # Weights are stored in half precision.
-    torch.testing.assert_close(by_name(frames[0]), by_module(frames[0]), rtol=1e-2, atol=1e-2)
-    assert "expected one of" in refused(lambda: Denoiser("nothing"))
-    assert "expected weights of model 'cascaded'" in refused(lambda: Denoiser("cascaded", weights=weights))
-
-
 # Precision
-
-
-def test_bfloat16_is_close_to_float32(frames: list[Frame]) -> None:
-    exact, rounded = Denoiser(small_model()), Denoiser(small_model(), precision="bfloat16")
-    for frame in frames:
-        output, half = exact.output(frame), rounded.output(frame)
-        # Only the network is rounded.
-        assert torch.equal(half.stages["noisy"], output.stages["noisy"])
-        assert torch.equal(half.stages["accumulated"], output.stages["accumulated"])
-        for expected, image in ((output.stages["initial"], half.stages["initial"]), (output.image, half.image)):
-            assert image.dtype == torch.float32
-            error = (image - expected).abs()
-            # Measured at most: 6e-4 of the mean, and 9e-4 of the largest value.
-            assert error.mean() < 2e-3 * expected.mean()
-            assert error.max() < 3e-3 * expected.max()
-            assert not torch.equal(image, expected)
 
 
 def test_a_network_that_hands_out_bfloat16_still_gives_float32() -> None:
@@ -273,12 +165,6 @@ def test_a_network_that_hands_out_bfloat16_still_gives_float32() -> None:
             assert output.image.dtype == torch.float32
             if buffers:
                 assert {image.dtype for image in output.stages.values()} == {torch.float32}
-
-
-@pytest.mark.parametrize("precision", ["float16", ""])
-def test_an_unknown_precision_is_refused(precision: Any) -> None:
-    message = refused(lambda: Denoiser(Keep(), precision=precision))
-    assert message == f"precision: expected one of auto, float32, bfloat16, found '{precision}'"
 
 
 # The state
@@ -372,16 +258,10 @@ def test_a_result_that_is_none_is_refused_in_one_line_and_not_kept(name: str) ->
         ({"a": 4}, {"a": 4}, True),
         ({"a": 4}, {"a": 3}, False),
         ({"a": 4}, {"b": 4}, False),
-        ({"a": 4}, {"a": 4, "b": 4}, False),
-        ((4, 4), (4, 4), True),
         ((4, 4), (4,), False),
-        ([4, 4], (4, 4), False),
         ((4, None), (4, 4), True),
-        ((4, 4), (4, None), True),
-        (None, {"a": 4}, True),
         ({"a": (4, None)}, {"a": (4, {"b": 3})}, True),
         ({"a": (4, {"b": 3})}, {"a": (4, {"b": 4})}, False),
-        ({"a": 4}, {"a": {"b": 4}}, False),
     ],
 )
 def test_a_state_keeps_its_structure(first: Any, second: Any, same: bool) -> None:
@@ -412,10 +292,7 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
     denoiser = Denoiser("cascaded_v2_micro", alpha_min=0.3, anti_lag=False)
     accumulated = next(parts_of(denoiser.model, Accumulated))
     assert (accumulated.alpha_min, accumulated.lag_threshold) == (0.3, float("inf"))
-    for make in (
-        lambda: Denoiser("cascaded_v2", width=9),
-        lambda: Denoiser("cascaded_v2", weights=weights, width=9),
-    ):
+    for make in (lambda: Denoiser("cascaded_v2", width=9), lambda: Denoiser("cascaded_v2", weights=weights, width=9)):
         message = refused(make)
         assert (
             "but alpha_min, anti_lag, tolerance, restore beside its weights, found width=9; the weights fix width"
@@ -429,66 +306,6 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
     assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))
-
-
-def test_the_report_of_a_frame(frames: list[Frame]) -> None:
-    denoiser = Denoiser(small_model())
-    denoiser.reset(frames=2)
-    for frame in frames[:2]:
-        denoiser(frame)
-    report = denoiser.report
-    assert report.stages == {
-        "demodulate": Stage("demodulate", 0, "albedo"),
-        "accumulate": Stage("accumulate", 0, "positions and cameras"),
-        "reproject": Stage("reproject", 0, "positions and cameras"),
-        "remember": Stage("remember", 1, "last frame"),
-        "noise-free pixels": Stage("noise-free pixels", 0, "there are none"),
-        "converged tiles": Stage("converged tiles", 0, "there are none", exact=False),
-        "unchanged tiles": Stage("unchanged tiles", 0, "there are none", exact=False),
-        "network": Stage("network", 0, "on 100% of the pixels"),
-    }
-    assert all(name == stage.name for name, stage in report.stages.items())
-    assert list(report.milliseconds) == STAGES
-    lines = str(report).splitlines()
-    names = ["milliseconds", "history", "skipped", "tiles", "precision"]
-    assert [line.partition(":")[0] for line in lines] == names
-    assert lines[0].startswith("milliseconds: validate ")
-    assert lines[2] == "skipped: remember (last frame)"
-    assert repr(report).startswith("FrameReport(milliseconds={")
-    denoiser = Denoiser(Keep())
-    denoiser(frames[0])
-    assert denoiser.report.stages == {}
-    assert list(denoiser.report.milliseconds) == ["validate", "Keep"]
-
-
-def test_history_is_of_use_to_more_than_one_frame_that_tells_motion() -> None:
-    denoiser = Denoiser(small_model())
-    moving, cameras, still = {"color", "motion"}, {"color", "position", "view_projection"}, {"color", "position"}
-    for frames, expected in ((None, True), (2, True), (1, False)):
-        denoiser.reset(frames=frames)
-        assert [denoiser.has_history(each) for each in (moving, cameras, still)] == [expected, expected, False]
-    denoiser = Denoiser(small_model(), keep_all=True)
-    denoiser.reset(frames=1)
-    assert denoiser.has_history(still)
-
-
-def test_hints_go_to_the_method(frames: list[Frame]) -> None:
-    seen: list[Frame] = []
-
-    class Watching(Mean):
-        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
-            seen.append(frame)
-            return super().forward(frame, state)
-
-    for keep_all in (False, True):
-        denoiser = Denoiser(Watching(), keep_all=keep_all)
-        denoiser.reset(frames=2)
-        denoiser(frames[0])
-        denoiser.output(frames[1])
-        first, second = (frame.hints for frame in seen[-2:])
-        assert (first.last, second.last) == (False, True)
-        assert (first.stages, second.stages) == (False, True)
-        assert first.keep_all is second.keep_all is keep_all
 
 
 # Derivatives
@@ -518,29 +335,6 @@ def test_the_derivative_through_time_of_a_method_written_out() -> None:
         image = denoiser(Frame(color=color))
     for gradient in torch.autograd.grad(image.sum(), colors):
         torch.testing.assert_close(gradient, torch.full_like(gradient, 1 / 3))
-
-
-def test_tiles_are_those_that_were_asked_for(frames: list[Frame]) -> None:
-    model = small_model()
-    denoiser = Denoiser(model, tile=64)
-    denoiser(frames[0])
-    assert denoiser.report.tiles == "1 x 1 tiles of up to 24x20 pixels: as asked for"
-    assert {tiled.side for tiled in parts_of(model, Tiled)} == {64}
-
-
-def test_depth_comes_from_positions_and_camera(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
-    with_depth, without = Denoiser(small_model()), Denoiser(small_model())
-    for number in sequence.numbers:
-        frame = sequence.frame(number)
-        expected = with_depth(frame.with_depth())
-        image = without(frame.replace(depth=None))
-        assert without.report.missing == []
-        hit = frame.normal.abs().sum(1, keepdim=True) > 0
-        derived = frame.replace(depth=None).with_depth().depth
-        torch.testing.assert_close(derived[hit], frame.depth[hit], rtol=1e-3, atol=0)
-        assert image.isfinite().all()
-        assert expected.shape == image.shape
 
 
 def test_a_model_of_ones_own_is_timed_under_its_name_in_any_wrapper(frames: list[Frame]) -> None:

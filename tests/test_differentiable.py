@@ -1,7 +1,5 @@
 """Derivatives through time: of the third frame of a shot in the buffers of the first, against finite differences."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -116,14 +114,6 @@ def test_derivative_of_the_third_frame_in_the_first(name: str, size: tuple[int, 
     assert sizes["color"] > 0
     assert sizes["albedo"] > 0
     assert sizes["normal"] == 0
-
-
-def test_images_are_those_without_derivatives() -> None:
-    frames = [{name: buffer.float() for name, buffer in buffers.items()} for buffers in shot((24, 40))]
-    with_graph = last_image(Denoiser("cascaded_v2_micro", differentiable=True), frames)
-    without = last_image(Denoiser("cascaded_v2_micro"), frames)
-    torch.testing.assert_close(with_graph.detach(), without, rtol=1e-5, atol=1e-6)
-    assert without.grad_fn is None
 
 
 def test_derivative_in_the_normals_of_the_same_frame() -> None:

@@ -1,17 +1,13 @@
 """Rendering as Mitsuba's own renderer samples: filter, lens, and features with noise."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from mcdenoise.data.exr import read_exr
-from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import FILTERS, Camera, Film, render_sequence
@@ -101,20 +97,6 @@ def test_every_noise_seed_has_features_of_its_own_samples(sequence: Path) -> Non
     assert np.linalg.norm(read(sequence, "shading_normal0"), axis=-1).max() < 1.001
 
 
-def test_the_reader_gives_each_noise_seed_its_own(sequence: Path) -> None:
-    found = open_sequence(sequence.parent)
-    assert found.noise_seeds == 2
-    assert found.noisy == {"color", "albedo", "normal", "position", "depth"}
-    first, second = (found.frame(1, noise_seed=k).validate()[0] for k in range(2))
-    for name, file in (("albedo", "albedo1"), ("color", "color1"), ("position", "world_position1")):
-        for k, frame in enumerate((first, second)):
-            stored = read(sequence / f"noise_seed{k}" if k else sequence, file)
-            given = dict(frame.items())[name][0].permute(1, 2, 0).double().numpy()
-            np.testing.assert_array_equal(given, stored)
-    assert torch.equal(first.reference, second.reference)  # type: ignore[arg-type]
-    assert torch.equal(first.view_projection, second.view_projection)  # type: ignore[arg-type]
-
-
 def test_positions_are_seen_within_the_filter_of_their_pixels(tmp_path: Path) -> None:
     """Box and wall: the sample of a pixel lies in that pixel, and its depth is the distance along the axis."""
     folder = render_sequence(wall(), AT_WALL, tmp_path, reference_spp=1, film=Film("box"), **SCALAR)
@@ -128,25 +110,6 @@ def test_positions_are_seen_within_the_filter_of_their_pixels(tmp_path: Path) ->
         assert offset.max() < 1 + 1e-3
         assert 0.2 < offset.std() < 0.4  # that of even numbers is 0.29
     np.testing.assert_allclose(read(folder, "depth0")[..., 0], clip[..., 3], rtol=ROUNDING)
-
-
-def test_normals_of_a_back_side_are_turned_to_the_viewer(tmp_path: Path) -> None:
-    behind = [Camera.look_at((0, 0, -3), (0, 0, 0), fov_x=20)]
-    folder = render_sequence(wall(), behind, tmp_path, reference_spp=1, film=Film(), **SCALAR)
-    np.testing.assert_allclose(read(folder, "shading_normal0")[HEIGHT // 2, WIDTH // 2], (0, 0, -1), atol=1e-3)
-
-
-def test_a_lens_blurs_what_it_is_not_focused_on(tmp_path: Path) -> None:
-    """Three lenses: a pinhole, one that is focused on the wall, one on half the way."""
-
-    def contrast(film: Film, name: str) -> float:
-        folder = render_sequence(wall(), AT_WALL, tmp_path / name, reference_spp=256, film=film, max_depth=2, **SCALAR)
-        return float(read(folder, "reference0")[4:-4, 6:-6].std())
-
-    sharp, focused = contrast(Film(), "pinhole"), contrast(Film(aperture=0.15, focus=3.0), "focused")
-    blurred = contrast(Film(aperture=0.15, focus=1.5), "blurred")
-    assert focused > 0.8 * sharp
-    assert blurred < 0.5 * sharp
 
 
 def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
@@ -193,35 +156,3 @@ def test_previous_positions_of_what_moves(tmp_path: Path) -> None:
     np.testing.assert_allclose(before[on_wall], position[on_wall], atol=1e-5)
     first = read(folder, "previous_position0")
     np.testing.assert_allclose(first, read(folder, "world_position0"), atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"filter": "lanczos"}, "pixel filter: expected one of box, gaussian, tent, mitchell, found 'lanczos'"),
-        ({"aperture": -1.0}, "aperture: expected a radius of at least 0, found -1"),
-        ({"aperture": float("nan")}, "aperture: expected a radius of at least 0, found nan"),
-        ({"focus": 0.0}, "focus: expected a distance above 0, found 0"),
-    ],
-)
-def test_bad_films(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        Film(**settings)
-    assert str(caught.value) == message
-
-
-def test_kept_samples_have_features_of_their_own(tmp_path: Path) -> None:
-    render_sequence(
-        wall(), AT_WALL, tmp_path, spp=4, reference_frames=[], film=Film("box"), keep_samples=True, **SCALAR
-    )
-    frame = open_sequence(tmp_path).frame(0)
-    assert frame.samples is not None
-    assert frame.albedo is not None
-    assert frame.depth is not None
-    assert frame.samples.shape == (1, 4, 10, HEIGHT, WIDTH)
-    mean = frame.samples.mean(1)
-    for found, given in ((mean[:, :3], frame.color), (mean[:, 3:6], frame.albedo), (mean[:, 9:], frame.depth)):
-        torch.testing.assert_close(found, given, rtol=2 * ROUNDING, atol=2.0**-24)
-    # Light as even as here comes with the albedo of what each sample has hit, which the squares make 0.2 or 0.8.
-    assert not torch.equal(frame.samples[:, 0, 3:6], frame.samples[:, 1, 3:6])
-    assert set(frame.samples[:, :, 3:6].double().round(decimals=2).unique().tolist()) == {0.2, 0.8}

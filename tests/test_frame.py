@@ -1,16 +1,13 @@
 """The vocabulary of buffers: what a frame refuses, what it repairs, and what it leaves alone."""
 
-from __future__ import annotations
-
-import math
-
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import BUFFERS, MOTION, Frame, Hints, Skip
+from mcdenoise.frame import BUFFERS, Frame, Hints, Skip
 
 NAN, INF = float("nan"), float("inf")
 SIZE = (5, 7)
@@ -25,112 +22,47 @@ def full_frame() -> Frame:
     return Frame(**buffers, view_projection=torch.eye(4).expand(2, 4, 4))
 
 
-def complaint(error: pytest.ExceptionInfo[InputError]) -> str:
-    """The message of an error, which must be one line."""
-    message = str(error.value)
-    assert "\n" not in message
-    return message
-
-
-def test_a_good_frame_is_left_alone() -> None:
-    frame = full_frame()
-    clean, replaced = frame.validate()
-    assert replaced == 0
-    assert clean is frame
-    assert frame.size == SIZE
-    assert {name for name, _ in frame.items()} == {*BUFFERS, "view_projection"}
-
-
-def test_color_alone_is_a_frame() -> None:
-    assert [name for name, _ in Frame(color=plane(3)).items()] == ["color"]
-
-
 @pytest.mark.parametrize(
     ("name", "value", "expected", "found"),
     [
         ("color", plane(4), "(B, 3, H, W)", "(2, 4, 5, 7)"),
         ("color", plane(3)[0], "(B, 3, H, W)", "(3, 5, 7)"),
-        ("color", plane(3)[..., :0], "(B, 3, H, W)", "(2, 3, 5, 0)"),
-        ("color", plane(3)[:0], "(B, 3, H, W)", "(0, 3, 5, 7)"),
         ("color", None, "torch.Tensor", "NoneType"),
         ("color", plane(3).to(torch.uint8), "floating-point", "torch.uint8"),
         ("albedo", plane(3).numpy(), "torch.Tensor", "ndarray"),
         ("albedo", plane(3)[..., 1:], "(2, 3, 5, 7)", "(2, 3, 5, 6)"),
         ("normal", plane(3)[:1], "(2, 3, 5, 7)", "(1, 3, 5, 7)"),
         ("depth", plane(3), "(2, 1, 5, 7)", "(2, 3, 5, 7)"),
-        ("depth", plane(1).to(torch.complex64), "floating-point", "torch.complex64"),
         ("position", plane(3).to("meta"), "on cpu", "on meta"),
-        ("motion", plane(3), "(2, 2, 5, 7)", "(2, 3, 5, 7)"),
         ("view_projection", torch.eye(4), "(2, 4, 4)", "(4, 4)"),
-        ("reference", plane(3).mT, "(2, 3, 5, 7)", "(2, 3, 7, 5)"),
-        ("roughness", plane(3), "(2, 1, 5, 7)", "(2, 3, 5, 7)"),
-        ("variance", plane(1), "(2, 3, 5, 7)", "(2, 1, 5, 7)"),
-        ("samples", plane(3), "(2, 3, 3, 5, 7)", "(2, 3, 5, 7)"),
         ("samples", plane(3)[:, None, ..., 1:].expand(2, 4, 3, 5, 6), "(2, 4, 3, 5, 7)", "(2, 4, 3, 5, 6)"),
     ],
 )
 def test_a_mismatch_names_buffer_expected_and_found(name: str, value: object, expected: str, found: str) -> None:
-    with pytest.raises(InputError) as error:
-        Frame(**{"color": plane(3), name: value})  # type: ignore[arg-type]
-    message = complaint(error)
+    message = refused(Frame, **{"color": plane(3), name: value})
     assert message.startswith(f"buffer '{name}': expected ")
     wanted, _, got = message.partition(", found ")
     assert expected in wanted
     assert found in got
 
 
-def test_depth_may_be_infinite() -> None:
-    frame = Frame(color=plane(3), depth=plane(1, INF))
-    assert frame.validate()[0] is frame
-
-
-@pytest.mark.parametrize(
-    ("name", "bad"),
-    [
-        ("roughness", NAN),
-        ("variance", INF),
-        ("albedo", NAN),
-        ("albedo", INF),
-        ("normal", NAN),
-        ("depth", NAN),
-        ("depth", -INF),
-        ("position", INF),
-        ("motion", NAN),
-        ("reference", INF),
-    ],
-)
+@pytest.mark.parametrize(("name", "bad"), [("albedo", NAN), ("depth", NAN), ("depth", -INF), ("position", INF)])
 def test_values_that_are_not_finite_are_refused_with_their_place(name: str, bad: float) -> None:
     value = plane(BUFFERS[name].channels)
     value[1, 0, 3, 4] = bad
-    with pytest.raises(InputError) as error:
-        Frame(color=plane(3), **{name: value}).validate()
-    message = complaint(error)
+    message = refused(Frame(color=plane(3), **{name: value}).validate)
     assert message.startswith(f"buffer '{name}': expected finite")
     assert "found 1 NaN or infinite ones, first at row 3, column 4" in message
-
-
-def test_a_matrix_that_is_not_finite_is_refused_with_its_place() -> None:
-    matrix = torch.eye(4).repeat(2, 1, 1)
-    matrix[1, 2, 3] = NAN
-    with pytest.raises(InputError) as error:
-        Frame(color=plane(3), view_projection=matrix).validate()
-    assert "buffer 'view_projection'" in complaint(error)
-    assert "first at [2, 3]" in complaint(error)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "clamped"),
     [
         ("albedo", 1.3, 1.0),
-        ("albedo", 2.0, 1.0),
         ("albedo", -0.001, 0.0),
         ("normal", 1.0005, 1.0),
-        ("normal", -1.0005, -1.0),
         ("depth", -0.001, 0.0),
-        ("roughness", 1.005, 1.0),
         ("specular_albedo", 1.5, 1.0),
-        ("variance", -0.001, 0.0),
-        ("reference", -0.001, 0.0),
     ],
 )
 def test_a_small_overshoot_is_clamped(name: str, value: float, clamped: float) -> None:
@@ -140,22 +72,11 @@ def test_a_small_overshoot_is_clamped(name: str, value: float, clamped: float) -
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("albedo", 255.0),
-        ("albedo", -0.5),
-        ("normal", 128.0),
-        ("normal", -1.5),
-        ("depth", -1.0),
-        ("reference", -1.0),
-        ("reference", 1e38),
-    ],
+    ("name", "value"), [("albedo", 255.0), ("normal", 128.0), ("depth", -1.0), ("reference", 1e38)]
 )
 def test_values_far_outside_their_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(InputError) as error:
-        Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, value)}).validate()
+    message = refused(Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, value)}).validate)
     spec = BUFFERS[name]
-    message = complaint(error)
     assert message.startswith(f"buffer '{name}': expected values in [{spec.low:g}, {spec.high:g}]")
     assert message.endswith(f"found [{value:g}, {value:g}]")
 
@@ -170,69 +91,7 @@ def test_a_lamp_among_reflectances_is_clamped_with_a_warning() -> None:
     assert (clean.albedo[..., 1:] == 0.5).all()
 
 
-@pytest.mark.parametrize("name", ["position", "motion"])
-def test_unbounded_buffers_take_any_finite_value(name: str) -> None:
-    frame = Frame(color=plane(3), **{name: plane(BUFFERS[name].channels, -1e30)})
-    assert frame.validate()[0] is frame
-
-
-def test_validate_repairs_and_keeps_the_other_buffers() -> None:
-    color = plane(3, NAN)
-    color[:, :, 0, 0] = 1
-    frame = full_frame().replace(color=color, albedo=plane(3, 1.5))
-    clean, replaced = frame.validate()
-    assert replaced == 2 * (math.prod(SIZE) - 1)
-    assert clean.normal is frame.normal
-    assert clean.validate() == (clean, 0)
-
-
-def test_replace_checks_again() -> None:
-    with pytest.raises(InputError, match="buffer 'depth'"):
-        full_frame().replace(depth=plane(2))
-    assert full_frame().replace(reference=None).reference is None
-
-
-def test_to_moves_every_buffer() -> None:
-    frame = full_frame().to(torch.float64)
-    assert all(value.dtype == torch.float64 for _, value in frame.items())
-
-
-def test_frames_can_be_compared_and_hashed() -> None:
-    frame = full_frame()
-    assert frame != full_frame()
-    assert frame in {frame}
-
-
-def test_frames_cannot_be_changed() -> None:
-    with pytest.raises(AttributeError):
-        full_frame().color = plane(3)  # type: ignore[misc]
-
-
 # The whole vocabulary
-
-
-def test_every_buffer_of_the_vocabulary_has_a_field_and_a_meaning() -> None:
-    names = {name for name, _ in full_frame().items()}
-    assert set(BUFFERS) <= names
-    assert set(BUFFERS) >= MOTION
-    for name, spec in BUFFERS.items():
-        assert spec.low < spec.high, name
-        assert spec.meaning
-        assert spec.channels in (1, 2, 3)
-
-
-def test_buffers_are_found_by_name_also_unknown_ones() -> None:
-    crypto, samples = plane(5), torch.rand(2, 4, 3, *SIZE)
-    frame = Frame(color=plane(3), samples=samples, extra={"crypto": crypto})
-    assert frame.buffers == {"color", "samples", "crypto"}
-    assert frame.buffer("crypto") is crypto
-    assert frame.buffer("samples") is samples
-    assert frame.buffer("depth") is None
-    assert frame.buffer("nothing") is None
-    # Fields that are no buffers are not found.
-    assert frame.buffer("extra") is None
-    assert frame.buffer("hints") is None
-    assert [name for name, _ in frame.items()] == ["color", "samples", "crypto"]
 
 
 def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
@@ -284,19 +143,6 @@ def test_depth_is_the_clip_w_of_positions() -> None:
         assert other.with_depth() is other
 
 
-def test_buffers_of_motion_can_be_omitted() -> None:
-    frame = full_frame().without_history()
-    assert frame.buffers == {*BUFFERS, "view_projection"} - MOTION
-
-
-def test_known_results_are_those_of_the_stage_or_of_the_last_one() -> None:
-    first, last = plane(3, 1.0), plane(3, 2.0)
-    skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"initial": first, "image": last})
-    assert skip.of("initial") is first
-    assert skip.of("image") is skip.of("other") is last
-    assert Skip(skip.mask, {}).of("image") is None
-
-
 # A frame is a pytree
 
 
@@ -330,22 +176,6 @@ def test_a_frame_comes_apart_and_together(make: object) -> None:
     paths = [pytree.keystr(path) for path, _ in pytree.tree_flatten_with_path(frame)[0]]
     assert paths[0] == ".color"
     assert len(set(paths)) == len(leaves)
-
-
-def test_hints_and_buffers_are_its_structure() -> None:
-    def spec(frame: Frame) -> pytree.TreeSpec:
-        return pytree.tree_structure(frame)
-
-    frame = full_frame()
-    assert spec(frame) == spec(full_frame().map(lambda value: value + 1))
-    assert spec(frame) != spec(frame.replace(hints=Hints(last=True)))
-    assert spec(frame) != spec(frame.replace(depth=None))
-
-
-def test_a_tree_of_something_else_is_not_checked() -> None:
-    shapes = pytree.tree_map(lambda value: tuple(value.shape), full_frame())
-    assert shapes.color == (2, 3, *SIZE)
-    assert shapes.view_projection == (2, 4, 4)
 
 
 def test_torch_func_takes_frames() -> None:

@@ -1,14 +1,12 @@
 """Arrays in, an array out: what `Frame.from_numpy` and `denoise` take, in which layout, and what they refuse."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
-import mcdenoise
 from mcdenoise import Denoiser, Frame, InputError, denoise
 from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
 
@@ -22,13 +20,6 @@ def image(channels: int, layout: Layout = "HWC", *, seed: int = 0, dtype: Any = 
     """The same pixels in either layout."""
     pixels = np.random.default_rng(seed).random((HEIGHT, WIDTH, channels)).astype(dtype)
     return pixels if layout == "HWC" else np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
-
-
-def complaint(error: pytest.ExceptionInfo[InputError]) -> str:
-    """The message of an error, which must be one line."""
-    message = str(error.value)
-    assert "\n" not in message
-    return message
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -52,22 +43,6 @@ def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None
     assert torch.equal(frame.samples[0, 1].permute(1, 2, 0), torch.from_numpy(image(5, seed=51)))
     assert torch.equal(frame.extra["crypto"][0].permute(1, 2, 0), torch.from_numpy(image(2, seed=60)))
     assert frame.extra["matte"].shape == (1, 1, HEIGHT, WIDTH)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_one_channel_needs_no_axis(layout: Layout) -> None:
-    depth = image(1, layout)
-    for value in (depth, depth.squeeze()):
-        frame = Frame.from_numpy(image(3, layout), depth=value, layout=layout)
-        assert frame.depth is not None
-        assert torch.equal(frame.depth[0, 0], torch.from_numpy(depth.squeeze()))
-
-
-def test_an_image_three_pixels_wide_is_of_the_layout_that_is_named() -> None:
-    cube = np.random.default_rng(0).random((3, 3, 3)).astype(np.float32)
-    first, second = (Frame.from_numpy(cube, layout=layout).color[0] for layout in LAYOUTS)
-    assert torch.equal(second, torch.from_numpy(cube))
-    assert torch.equal(first, torch.from_numpy(cube).permute(2, 0, 1))
 
 
 @pytest.mark.parametrize(
@@ -120,16 +95,6 @@ def test_arrays_of_any_memory(view: Any) -> None:
     assert torch.equal(frame.color[0].permute(1, 2, 0), torch.from_numpy(pixels))
 
 
-def test_memory_is_shared_where_that_is_possible() -> None:
-    pixels, fixed = image(3), read_only(image(3))
-    frame = Frame.from_numpy(pixels, albedo=fixed)
-    frame.color[0, 1, 2, 3] = 8
-    assert pixels[2, 3, 1] == 8
-    assert frame.albedo is not None
-    frame.albedo[0, 1, 2, 3] = 8
-    assert fixed[2, 3, 1] != 8
-
-
 @pytest.mark.parametrize(
     ("color", "layout", "message"),
     [
@@ -151,10 +116,9 @@ def test_memory_is_shared_where_that_is_possible() -> None:
 )  # fmt: skip
 def test_arrays_that_are_no_color_are_refused_in_one_line(color: Any, layout: Layout, message: str) -> None:
     for function in (Frame.from_numpy, denoise):
-        with pytest.raises(InputError) as caught:
-            function(color, layout=layout)
-        assert complaint(caught).startswith("buffer 'color': ")
-        assert message in complaint(caught)
+        told = refused(function, color, layout=layout)
+        assert told.startswith("buffer 'color': ")
+        assert message in told
 
 
 @pytest.mark.parametrize(
@@ -174,10 +138,9 @@ def test_arrays_that_are_no_color_are_refused_in_one_line(color: Any, layout: La
 )
 def test_buffers_that_do_not_fit_the_color_are_refused_in_one_line(name: str, value: Any, message: str) -> None:
     for function in (Frame.from_numpy, denoise):
-        with pytest.raises(InputError) as caught:
-            function(image(3), **{name: value})
-        assert complaint(caught).startswith(f"buffer '{name}': ")
-        assert message in complaint(caught)
+        told = refused(function, image(3), **{name: value})
+        assert told.startswith(f"buffer '{name}': ")
+        assert message in told
 
 
 def test_names_and_layouts_that_are_none() -> None:
@@ -203,11 +166,10 @@ def test_names_and_layouts_that_are_none() -> None:
     ],
 )
 def test_a_misspelt_argument_is_named_without_its_value(name: str, model: Any, near: str) -> None:
-    with pytest.raises(InputError) as caught:
-        denoise(image(3), model=model, **{name: image(3)})
-    assert complaint(caught).startswith(f"argument '{name}': expected a buffer or an argument of Denoiser")
-    assert complaint(caught).endswith(f", found none of this name; did you mean {near}?")
-    assert "0." not in complaint(caught)
+    message = refused(denoise, image(3), model=model, **{name: image(3)})
+    assert message.startswith(f"argument '{name}': expected a buffer or an argument of Denoiser")
+    assert message.endswith(f", found none of this name; did you mean {near}?")
+    assert "0." not in message
 
 
 def test_a_warning_shows_the_line_of_the_caller() -> None:
@@ -225,8 +187,7 @@ def test_a_warning_shows_the_line_of_the_caller() -> None:
 # A still in one call
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize(("layout", "dtype"), [("HWC", np.float16), ("CHW", np.float64)])
 def test_a_still_is_what_the_denoiser_makes_of_it(layout: Layout, dtype: Any) -> None:
     color, albedo, normal = (image(3, layout, seed=seed, dtype=dtype) for seed in range(3))
     depth = image(1, layout, seed=3, dtype=dtype)
@@ -246,36 +207,3 @@ def test_a_still_is_what_the_denoiser_makes_of_it(layout: Layout, dtype: Any) ->
         np.argsort(axes).tolist()
     )
     assert np.array_equal(clean, expected.numpy())
-
-
-def test_a_model_that_does_nothing_gives_back_the_same_pixels() -> None:
-    pixels = image(3, dtype=np.float64)[::-1]
-    assert np.array_equal(denoise(pixels, model="noisy"), pixels.astype(np.float32))
-
-
-def test_models_and_settings_are_those_of_the_denoiser() -> None:
-    color = image(3)
-    doubled = denoise(color, model=lambda color: 2 * color)
-    assert np.array_equal(doubled, 2 * color)
-    narrow, wide = (denoise(color, model="joint_bilateral", sigma_space=sigma) for sigma in (1, 3))
-    assert not np.array_equal(narrow, wide)
-    with pytest.raises(InputError, match="precision"):
-        denoise(color, model=MODEL, precision="float8")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="device"):
-        denoise(color, model=MODEL, device="nowhere")
-
-
-def test_values_that_would_spoil_the_result_are_refused() -> None:
-    albedo = image(3)
-    albedo[2, 3, 1] = np.nan
-    with pytest.raises(InputError) as caught:
-        denoise(image(3), albedo=albedo, model=MODEL)
-    assert "buffer 'albedo'" in complaint(caught)
-    assert "row 2, column 3" in complaint(caught)
-    broken = image(3)
-    broken[2, 3, 1] = np.inf
-    assert np.isfinite(denoise(broken, model=MODEL)).all()
-
-
-def test_the_package_has_it() -> None:
-    assert mcdenoise.denoise is denoise

@@ -1,8 +1,5 @@
 """Commands that are told to end, at any moment: one line, the status of the signal, nothing left behind."""
 
-from __future__ import annotations
-
-import json
 import os
 import random
 import signal
@@ -12,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import succeeds
 
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 # It takes no more than 2 s where the machine is free; others may use it.
@@ -87,10 +85,7 @@ MOMENTS = {
     "destructors": "destroyed()",
     "what tidies up in compiled code": "tidied(endless)",
 }
-WRITING = {
-    "a file": "file(lambda: time.sleep(60))",
-    "a folder, in compiled code": "folder(endless)",
-}
+WRITING = {"a file": "file(lambda: time.sleep(60))", "a folder, in compiled code": "folder(endless)"}
 
 
 # These tests may themselves run in the background, or under nohup, and what is ignored is inherited.
@@ -169,12 +164,9 @@ def test_signals_that_were_ignored_stay_ignored(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
-def test_within_another_program_signals_are_left_as_they_were(capsys: pytest.CaptureFixture[str]) -> None:
-    from mcdenoise.cli import main
-
+def test_within_another_program_signals_are_left_as_they_were() -> None:
     before = [signal.getsignal(number) for number in WORDS]
-    with pytest.raises(SystemExit):
-        main(["--version"])
+    succeeds("--version")
     assert [signal.getsignal(number) for number in WORDS] == before
     assert signal.set_wakeup_fd(-1) == -1
 
@@ -213,32 +205,5 @@ def frames(folder: Path) -> list[object]:
     return [folder / "inputs", "-o", folder / "out", "--model", "cascaded_v2_micro"]
 
 
-RENDER = ["--size", "32x24", "--reference-spp", "64", "--variant", "scalar_rgb"]
-
-
-def scene(folder: Path) -> list[object]:
-    """Arguments that render a small scene by two processes."""
-    pytest.importorskip("mitsuba")
-    (folder / "scene.xml").write_text(
-        '<scene version="3.0.0"><integrator type="path"/><shape type="sphere"/><emitter type="constant"/></scene>'
-    )
-    cameras = [{"position": [0, 0.1 * k, 5], "look_at": [0, 0, 0]} for k in range(4)]
-    (folder / "path.json").write_text(json.dumps({"fov": 40, "frames": cameras}))
-    return [folder / "scene.xml", "--camera-path", folder / "path.json", "-o", folder / "out", *RENDER]
-
-
 def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
     interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=2, seed=0)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_many_moments_of_denoise(tmp_path: Path) -> None:
-    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=20, seed=1)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_many_moments_of_render(tmp_path: Path) -> None:
-    arguments = [*scene(tmp_path), "--workers", 2]
-    interrupted_at_random(tmp_path, "render", arguments, count=12, seed=3)

@@ -1,7 +1,5 @@
 """The stand-in for `mi.OptixDenoiser`: bitmaps, tensors, gradients, and the meaning of its arguments here."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import sys
@@ -11,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError
@@ -83,13 +82,6 @@ def noise(channels: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).random((HEIGHT, WIDTH, channels)).astype(np.float32)
 
 
-def complaint(error: pytest.ExceptionInfo[InputError]) -> str:
-    """The message of an error, which must be one line."""
-    message = str(error.value)
-    assert "\n" not in message
-    return message
-
-
 def smape(image: Array, reference: Array) -> float:
     return float(np.mean(2 * np.abs(image - reference) / (np.abs(image) + np.abs(reference) + 0.01)))
 
@@ -117,20 +109,6 @@ def test_a_bitmap_of_layers_is_denoised_as_its_arrays_are(mi: Any, rendered: tup
     # Measured: 0.328 of one sample a pixel, 0.175 denoised.
     assert smape(pixels[..., :3], reference[..., :3]) < 0.7 * smape(given["<root>"][..., :3], reference[..., :3])
     assert denoiser.denoiser.report.missing == ["depth", "motion"]
-
-
-def test_the_default_is_the_model_of_the_package_and_arguments_have_optix_order(
-    mi: Any, rendered: tuple[Any, Array]
-) -> None:
-    bitmap, _ = rendered
-    denoiser = MitsubaDenoiser(mi.ScalarVector2u(WIDTH, HEIGHT), True, True, False, False)
-    first = denoiser(bitmap, "albedo", "normals", mi.ScalarTransform4f(), "", "", "<root>")
-    second = denoiser(bitmap, normals_ch="normals", albedo_ch="albedo")
-    assert np.array_equal(np.array(first), np.array(second))
-    # Neither alpha nor tiles need another model.
-    for arguments in ({"denoise_alpha": True}, {"tile": 64}):
-        other = MitsubaDenoiser((WIDTH, HEIGHT), **arguments).denoiser
-        assert other._name == denoiser.denoiser._name
 
 
 def test_bitmaps_without_layers_keep_their_pixel_format(mi: Any) -> None:
@@ -202,13 +180,6 @@ def test_tensors_are_denoised_as_arrays_are(variant: str, request: pytest.Fixtur
     np.testing.assert_allclose(clean.numpy()[..., :3], expected[0].permute(1, 2, 0).numpy(), rtol=1e-3, atol=1e-3)
 
 
-def test_features_that_were_not_announced_are_ignored(mi: Any) -> None:
-    color, broken = mi.TensorXf(noise(3)), mi.TensorXf(noise(3) * np.nan)
-    denoiser = MitsubaDenoiser((WIDTH, HEIGHT), model=MODEL)
-    assert np.array_equal(denoiser(color, broken, broken).numpy(), denoiser(color).numpy())
-    assert np.array_equal(denoiser(color, mi.TensorXf(), mi.TensorXf()).numpy(), denoiser(color).numpy())
-
-
 def of_torch(color: Array, weights: Tensor, **features: Tensor) -> dict[str, Array]:
     """Gradients of the weighted sum of the image, by torch alone, in the memory layout of Mitsuba."""
     leaves = {"color": torch.from_numpy(color), **features}
@@ -242,33 +213,6 @@ def test_gradients_are_those_of_torch(ad: Any) -> None:
     assert all(each.grad is None for each in denoiser.denoiser.model.parameters())
 
 
-# The warning is torch's own: it comes when its rules for forward mode are loaded.
-@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-def test_the_derivative_forward_is_the_one_backward(ad: Any) -> None:
-    drjit = importlib.import_module("drjit")
-    color, direction, weights = noise(3), noise(3, 1), noise(3, 2)
-    denoiser = MitsubaDenoiser((WIDTH, HEIGHT), temporal=True, model=MODEL)
-    flow = ad.TensorXf(np.zeros((HEIGHT, WIDTH, 2), np.float32))
-    found = []
-    for way in ("backward", "forward"):
-        first = denoiser(ad.TensorXf(noise(3, 5)), flow=flow)
-        tensor = ad.TensorXf(color)
-        drjit.enable_grad(tensor)
-        clean = denoiser(tensor, flow=flow, previous_denoised=first)
-        if way == "backward":
-            drjit.backward(drjit.sum(clean * ad.TensorXf(weights), axis=None))
-            found.append(float((drjit.grad(tensor).numpy().astype(np.float64) * direction).sum()))
-        else:
-            drjit.set_grad(tensor, ad.TensorXf(direction))
-            drjit.forward_to(clean)
-            found.append(float((drjit.grad(clean).numpy().astype(np.float64) * weights).sum()))
-        # The frame was computed again for derivatives forward, and is in the history once.
-        plain = denoiser(ad.TensorXf(noise(3, 6)), flow=flow, previous_denoised=clean).numpy()
-        found.append(float(plain.sum()))
-    assert found[0] == pytest.approx(found[2], rel=1e-4)
-    assert found[1] == pytest.approx(found[3], rel=1e-6)
-
-
 def test_gradients_end_at_the_history(ad: Any) -> None:
     drjit = importlib.import_module("drjit")
     flow = ad.TensorXf(np.zeros((HEIGHT, WIDTH, 2), np.float32))
@@ -283,16 +227,6 @@ def test_gradients_end_at_the_history(ad: Any) -> None:
     # Each frame can be differentiated by itself, the earlier one after the later one, too.
     drjit.backward(drjit.sum(before, axis=None))
     assert np.abs(drjit.grad(first).numpy()).max() > 0
-
-
-def test_a_refusal_within_the_operation_of_drjit_is_one_line(ad: Any) -> None:
-    albedo = noise(3, 1)
-    albedo[2, 3] = np.nan
-    color = ad.TensorXf(noise(3))
-    importlib.import_module("drjit").enable_grad(color)
-    with pytest.raises(InputError) as caught:
-        MitsubaDenoiser((WIDTH, HEIGHT), albedo=True, model=MODEL)(color, ad.TensorXf(albedo))
-    assert "buffer 'albedo'" in complaint(caught)
 
 
 # A shot
@@ -337,34 +271,15 @@ def test_previous_denoised_tells_where_a_shot_begins(mi: Any) -> None:
         np.testing.assert_allclose(result.numpy(), expected.numpy(), rtol=1e-3, atol=1e-3)
 
 
-def test_bitmaps_of_a_shot(mi: Any) -> None:
-    """Layers of the flow and of the previous image do what tensors do."""
-    names = ["R", "G", "B", "flow.X", "flow.Y", "last.R", "last.G", "last.B"]
-    flow = np.zeros((HEIGHT, WIDTH, 2), np.float32)
-    tensors, bitmaps = (MitsubaDenoiser((WIDTH, HEIGHT), temporal=True, model=MODEL) for _ in range(2))
-    last = noise(3)
-    for seed in range(3):
-        pixels = np.concatenate([noise(3, seed), flow, last], axis=2)
-        bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
-        clean = np.array(bitmaps(bitmap, flow_ch="flow", previous_denoised_ch="last"))
-        expected = tensors(mi.TensorXf(noise(3, seed)), flow=mi.TensorXf(flow), previous_denoised=mi.TensorXf(last))
-        assert np.array_equal(clean, expected.numpy())
-        last = clean
-
-
-def test_stills_have_no_history(mi: Any) -> None:
-    denoiser = MitsubaDenoiser((WIDTH, HEIGHT), model=MODEL)
-    first, other, again = (denoiser(mi.TensorXf(noise(3, seed))).numpy() for seed in (0, 1, 0))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
-
-
 # Bad input
 
 
 def test_arguments_that_do_not_fit_are_told_in_one_line(mi: Any) -> None:
     color, small = mi.TensorXf(noise(3)), mi.TensorXf(noise(3)[1:])
-    size = (WIDTH, HEIGHT)
+
+    def denoised(made: dict[str, Any], *arguments: Any, **named: Any) -> Any:
+        return MitsubaDenoiser((WIDTH, HEIGHT), **{"model": "noisy", **made})(*arguments, **named)
+
     cases: list[tuple[dict[str, Any], tuple[Any, ...], dict[str, Any], str]] = [
         ({}, (small,), {}, "noisy: expected shape (36, 64, 3 or 4) for images of 64x36"),
         ({}, (mi.TensorXf(noise(9)),), {}, "found (36, 64, 9)"),
@@ -381,9 +296,7 @@ def test_arguments_that_do_not_fit_are_told_in_one_line(mi: Any) -> None:
         ({"device": "nowhere"}, (color,), {}, "device 'nowhere'"),
     ]
     for made, arguments, named, message in cases:
-        with pytest.raises(InputError) as caught:
-            MitsubaDenoiser(size, **{"model": "noisy", **made})(*arguments, **named)
-        assert message in complaint(caught)
+        assert message in refused(denoised, made, *arguments, **named)
     for wrong in ((64,), (64, 0), (64.5, 36)):
         with pytest.raises(InputError, match="input_size:"):
             MitsubaDenoiser(wrong)
@@ -403,9 +316,3 @@ def test_without_mitsuba_one_line_says_what_to_install(missing: str, monkeypatch
     monkeypatch.setattr(importlib, "import_module", refuse)
     with pytest.raises(InputError, match=rf"{missing}.*mcdenoise\[render\]"):
         MitsubaDenoiser((WIDTH, HEIGHT))
-
-
-def test_importing_the_integration_loads_neither_mitsuba_nor_drjit() -> None:
-    code = "import sys, mcdenoise.integrations.mitsuba\nprint(sorted({'mitsuba', 'drjit'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

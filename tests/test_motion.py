@@ -1,7 +1,5 @@
 """Wrong motion is told while it is streamed, with the likely mistake; right motion never is."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -102,8 +100,9 @@ RIGHT: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("scene", RIGHT)
-@pytest.mark.parametrize("ways", [by_motion, by_cameras], ids=["motion", "cameras"])
-@pytest.mark.parametrize("without", [(), ("albedo",)], ids=["features", "color"])
+@pytest.mark.parametrize(
+    ("ways", "without"), [(by_motion, ("albedo",)), (by_cameras, ())], ids=["motion, color", "cameras, features"]
+)
 def test_right_motion_is_never_doubted(scene: str, ways: Callable[[Frame], Frame], without: tuple[str, ...]) -> None:
     if "ball" in RIGHT[scene] and ways is by_cameras:
         pytest.skip("cameras alone do not tell the motion of an object")

@@ -1,10 +1,6 @@
 """Images for people to look at: known codes, one exposure for all frames, a video of all of them."""
 
-from __future__ import annotations
-
 import json
-import math
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import refuses, succeeds
 from torch import Tensor
 
-from mcdenoise.cli import main
 from mcdenoise.data import read_exr
 from mcdenoise.data.png import Picture, read_png
-from mcdenoise.errors import InputError
 from mcdenoise.preview import Preview
 
 
@@ -39,15 +34,6 @@ def frames_of(path: Path) -> list[Picture]:
     av = pytest.importorskip("av")
     with av.open(path) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
-def test_middle_grey_is_code_118(tmp_path: Path) -> None:
-    assert code(0.18) == 118
-    for name, radiance in {"dark": 3e-6, "grey": 0.18, "bright": 4e5}.items():
-        preview = Preview(tmp_path, video=False)
-        preview.add(name, constant(radiance))
-        assert (shown(tmp_path, name) == 118).all()
-        assert preview.exposure == pytest.approx(math.log2(0.18 / radiance), abs=1e-4)
 
 
 @pytest.mark.parametrize("stops", [-3.0, 0.0, 1.5])
@@ -102,70 +88,12 @@ def test_the_video_has_the_pictures_in_their_order(tmp_path: Path) -> None:
     assert preview.written == [*pictures, tmp_path / "preview.mp4"]
 
 
-def test_a_still_has_no_video_and_an_old_one_goes(tmp_path: Path) -> None:
-    (tmp_path / "preview.mp4").write_bytes(b"of an earlier run")
-    preview = Preview(tmp_path)
-    preview.add("still", constant(1.0))
-    preview.close()
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["preview", "still.png"]
-
-
-def test_an_interrupted_preview_leaves_whole_pictures_and_no_video(tmp_path: Path) -> None:
-    preview = Preview(tmp_path)
-    preview.add("0", constant(1.0))
-    preview.add("1", constant(1.0, width=30))
-    with pytest.raises(InputError, match=r"preview\.mp4:"):
-        preview.close()
-    (tmp_path / "preview" / "1.png").write_bytes((tmp_path / "preview" / "0.png").read_bytes()[:-40])
-    with pytest.raises(InputError, match=r"1\.png:"):
-        preview.close()
-    (tmp_path / "preview" / "2.png").mkdir()
-    with pytest.raises(InputError, match=r"2\.png:"):
-        preview.add("2", constant(1.0))
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["0.png", "1.png", "2.png", "preview"]
-
-
-def test_something_in_the_way_of_the_folder(tmp_path: Path) -> None:
-    (tmp_path / "preview").write_text("a file")
-    with pytest.raises(InputError, match="preview:"):
-        Preview(tmp_path).add("0", constant(1.0))
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        ({"frames_per_second": 0.0}, "frames per second: expected 1 to 1000, found 0"),
-        ({"exposure": math.nan}, "exposure: expected -100 to 100 stops, found nan"),
-        ({"exposure": 1000.0}, "exposure: expected -100 to 100 stops, found 1000"),
-    ],
-)
-def test_settings_that_cannot_be(tmp_path: Path, settings: dict[str, float], expected: str) -> None:
-    with pytest.raises(InputError, match=expected):
-        Preview(tmp_path, **settings)  # type: ignore[arg-type]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_without_the_package_pictures_are_written_and_a_video_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"av.*mcdenoise\[preview\]"):
-        Preview(tmp_path)
-    Preview(tmp_path, video=False).add("0", constant(1.0))
-    assert shown(tmp_path, "0").shape == (20, 24, 3)
-
-
-def run(sequence: Path, out: Path, *options: str) -> int:
-    """Exit status of `mcdenoise denoise` with a method that needs no time."""
-    with pytest.raises(SystemExit) as stop:
-        main(["denoise", str(sequence), "-o", str(out), "--model", "accumulated", *options])
-    return int(stop.value.code or 0)
-
-
-def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    assert run(small_sequence, out, "--preview", "--preview-fps", "12", "--preview-exposure", "-1", "--full-float") == 0
-    preview, results = capsys.readouterr().out.splitlines()[-2:]
+def test_the_command_line(small_sequence: Path, out: Path) -> None:
+    command, settings = (
+        f"denoise {small_sequence} -o {out} --model accumulated",
+        "--preview-fps 12 --preview-exposure -1",
+    )
+    preview, results = succeeds(f"{command} --preview {settings} --full-float").splitlines()[-2:]
     assert preview == f"preview: {out / 'preview.mp4'}"
     assert results.endswith(f"{out / 'denoised0.exr'} to denoised3.exr")
     assert len(frames_of(out / "preview.mp4")) == 4
@@ -174,58 +102,27 @@ def test_the_command_line(small_sequence: Path, tmp_path: Path, capsys: pytest.C
         expected = [code(float(x) / 2) for x in radiance.ravel()]
         assert np.abs(shown(out, f"denoised{number}").ravel() - np.array(expected)).max() <= 1
     assert "show" in json.loads((out / "denoise.json").read_text())["beside"]
-    assert run(small_sequence, out, "--preview", "--frames", "2") == 0
-    assert capsys.readouterr().out.splitlines()[-2] == f"preview: {out / 'preview' / 'denoised2.png'}"
+    preview = succeeds(f"{command} --preview --frames 2").splitlines()[-2]
+    assert preview == f"preview: {out / 'preview' / 'denoised2.png'}"
     assert not (out / "preview.mp4").exists()
 
 
 def test_the_command_line_refuses_before_it_denoises(
-    small_sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    small_sequence: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out = tmp_path / "out"
-    assert run(small_sequence, out, "--preview-fps", "12") == 2
-    assert "expected together with --preview" in capsys.readouterr().err
-    assert run(small_sequence, out, "--preview", "--preview-fps", "0") == 2
-    assert "frames per second" in capsys.readouterr().err
+    command = f"denoise {small_sequence} -o {out} --model accumulated"
+    assert "expected together with --preview" in refuses(f"{command} --preview-fps 12")
+    assert "frames per second" in refuses(f"{command} --preview --preview-fps 0")
     monkeypatch.setitem(sys.modules, "av", None)
-    assert run(small_sequence, out, "--preview") == 2
-    assert "mcdenoise[preview]" in capsys.readouterr().err
+    assert "mcdenoise[preview]" in refuses(f"{command} --preview")
     assert not out.exists()
     # A still needs no package.
-    assert run(small_sequence, out, "--preview", "--frames", "1") == 0
+    succeeds(f"{command} --preview --frames 1")
 
 
-def test_a_damaged_frame_leaves_no_video(small_sequence: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_a_damaged_frame_leaves_no_video(small_sequence: Path, out: Path) -> None:
     color = small_sequence / "inputs" / "color2.exr"
     color.write_bytes(color.read_bytes()[:-300])
-    assert run(small_sequence, out, "--preview") == 2
+    refuses(f"denoise {small_sequence} -o {out} --model accumulated --preview")
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
     assert files == {f"{name}" for n in (0, 1) for name in (f"denoised{n}.exr", f"preview/denoised{n}.png")}
-
-
-_MEMORY = """
-import resource, sys
-from pathlib import Path
-import torch
-from mcdenoise.heap import keep_heap
-from mcdenoise.preview import Preview
-keep_heap()
-torch.set_num_threads(1)
-preview = Preview(Path(sys.argv[1]), video=False)
-frame = torch.rand(1, 3, 45, 80).repeat_interleave(8, 2).repeat_interleave(8, 3)
-def peak(count):
-    for _ in range(count):
-        preview.add(f"frame{len(preview.written)}", frame)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-before = peak(60)
-print((peak(180) - before) / frame.numel())
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="reads the peak of memory through the POSIX resource usage")
-def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
-    result = subprocess.run([sys.executable, "-c", _MEMORY, str(tmp_path)], capture_output=True, text=True, check=True)
-    # In pictures. What stays of each, be it a note in a cache that keeps a hole in the heap, makes it 100 and more.
-    assert float(result.stdout) < 30

@@ -1,7 +1,5 @@
 """Denoisers in several threads and processes, and what they leave behind in them."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import subprocess
@@ -19,8 +17,6 @@ from reads import without_reads
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError, ops
-from mcdenoise.models._defaults import plain_defaults
-from mcdenoise.ops._backend import choose_backend
 
 # Of each kind: kernels of a cascade, an a-trous filter, Open Image Denoise's network, and a local filter.
 METHODS = ["svgf", "cascaded_v2_micro", "oidn_tuned", "bmfr"]
@@ -82,23 +78,6 @@ def test_denoisers_in_two_threads_are_those_alone(pair: tuple[int, int]) -> None
         assert_alike(found, expected)
 
 
-def test_what_a_thread_sets_is_its_own() -> None:
-    inside, outside = threading.Event(), threading.Event()
-
-    def first() -> None:
-        with ops.use("torch"):
-            inside.set()
-            assert outside.wait(60)
-
-    def second() -> str:
-        assert inside.wait(60)
-        found = choose_backend(["numba"], [torch.ones(1, 3, 128, 128)])
-        outside.set()
-        return found
-
-    assert together(first, second)[1] == "numba"
-
-
 def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
     """As on a GPU, where values are read after the frame."""
     good = shot(1)[0]
@@ -127,20 +106,6 @@ def test_one_denoiser_takes_the_frames_of_several_threads_in_turn() -> None:
     # Which thread is the first is not known; every step of the shot is there, and each of them once.
     for image in alone:
         assert sum(torch.allclose(image, each, rtol=1e-5, atol=1e-6) for each in found) >= 1
-
-
-def test_the_default_dtype_survives_threads_that_overlap() -> None:
-    torch.set_default_dtype(torch.float64)
-    first, second = plain_defaults(), plain_defaults()
-    try:
-        first.__enter__()
-        second.__enter__()
-        first.__exit__(None, None, None)
-        assert torch.get_default_dtype() == torch.float32
-        second.__exit__(None, None, None)
-        assert torch.get_default_dtype() == torch.float64
-    finally:
-        torch.set_default_dtype(torch.float32)
 
 
 IN_CHILDREN = """

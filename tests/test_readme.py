@@ -1,15 +1,13 @@
 """The claims of the README are true, and its examples run."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
 import pytest
 import torch
+from commands import run, succeeds
 
 from mcdenoise.check.cases import OPS
-from mcdenoise.cli import main
 from mcdenoise.data import read_exr
 from mcdenoise.models import list_models
 
@@ -63,38 +61,31 @@ def test_its_figures_are_those_of_the_pages_that_it_links(figure: str, page: str
     assert re.search(rf"(?<![\d.]){re.escape(figure)}(?!\d)", README)
 
 
-def test_the_streaming_example_has_a_history() -> None:
-    report = code_with(ROOT / "docs" / "index.md", "denoiser = Denoiser")["denoiser"].report
-    assert (report.reset, report.missing, report.replaced_pixels) == ("", [], 0)
-
-
-def test_the_composed_example_has_a_history() -> None:
-    report = code_with(ROOT / "README.md", "denoiser = Denoiser")["denoiser"].report
+@pytest.mark.parametrize("page", ["docs/index.md", "README.md"])
+def test_the_example_has_a_history(page: str) -> None:
+    report = code_with(ROOT / page, "denoiser = Denoiser")["denoiser"].report
     assert (report.reset, report.missing, report.replaced_pixels) == ("", [], 0)
 
 
 def test_the_composed_example_does_what_is_promised(
-    tmp_path: Path, small_sequence: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small_sequence: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is trained, and with its weights it denoises and is measured."""
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     monkeypatch.chdir(tmp_path)
     write_composed(tmp_path)
 
-    def run(line: str) -> int:
-        with pytest.raises(SystemExit) as stop:
-            main(line.format(shot=small_sequence).split())
-        return int(stop.value.code or 0)
-
     small = "--steps 2 --crop 16 --frames 2 --batch 1 --validation-frames 0"
-    assert run(f"train {{shot}} -o run --model mine.py:network {small}") == 0
-    assert run("denoise {shot} -o out --model mine.py:network --weights run/network.safetensors") == 0
-    assert "random" not in capsys.readouterr().err
+    succeeds(f"train {small_sequence} -o run --model mine.py:network {small}")
+    status, _, said = run(f"denoise {small_sequence} -o out --model mine.py:network --weights run/network.safetensors")
+    assert status == 0
+    assert "random" not in said
     pixels = [read_exr(path)[0] for path in sorted((tmp_path / "out").glob("*.exr"))]
     assert len(pixels) == 4
     assert all((image >= 0).all() for image in pixels)
     measured = "mine.py:network(weights=run/network.safetensors)"
-    assert run(f"benchmark {{shot}} -o results --models {measured} --precisions float32 --sizes none --rounds 1") == 0
+    settings = "--precisions float32 --sizes none --rounds 1"
+    succeeds(f"benchmark {small_sequence} -o results --models {measured} {settings}")
 
 
 @pytest.mark.slow
@@ -102,11 +93,8 @@ def test_the_composed_example_does_what_is_promised(
 def test_the_composed_example_is_exported_and_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_composed(tmp_path)
-    stability = "stability --models mine.py:network --frames 5 --dtypes float32"
-    for line in ("export mine.py:network -o mine.pt2", stability):
-        with pytest.raises(SystemExit) as stop:
-            main(line.split())
-        assert not stop.value.code, line
+    succeeds("export mine.py:network -o mine.pt2")
+    succeeds("stability --models mine.py:network --frames 5 --dtypes float32")
 
 
 def write_composed(folder: Path) -> None:

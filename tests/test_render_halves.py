@@ -38,29 +38,6 @@ def test_noise_is_the_smape_against_the_truth(start: int) -> None:
     assert (halves.spp, halves.passes) == (start + 96, start + 6)
 
 
-def test_passes_go_to_the_smaller_half() -> None:
-    halves = ReferenceHalves.start(np.ones((1, 3)), 20, 20)
-    paths = []
-    for mean in passes(4, 16):
-        halves.add(mean[:1], 16)
-        paths.append(halves.paths)
-    assert paths == [(20, 16), (20, 32), (36, 32), (36, 48)]
-
-
-def test_the_noise_of_negative_radiance_is_positive() -> None:
-    halves = ReferenceHalves.start(np.zeros((2, 3)), 0, 0)
-    for value in (-0.02, -0.04):
-        halves.add(np.full((2, 3), value), 16)
-    # Half the difference, over 0.01 alone.
-    assert halves.noise() == pytest.approx(0.5 * 0.02 / 0.01)
-
-
-def test_one_half_alone_tells_nothing() -> None:
-    halves = ReferenceHalves.start(np.ones((1, 3)), 20, 20)
-    assert halves.noise() is None
-    np.testing.assert_array_equal(halves.mean(), 1)
-
-
 def test_saved_and_loaded(tmp_path: Path) -> None:
     halves = ReferenceHalves.start(np.zeros((PIXELS, 3)), 0, 0)
     for mean in passes(3, 16):

@@ -1,9 +1,6 @@
 """Results as they are stored: what was written is read again, and what is damaged is refused in one line."""
 
-from __future__ import annotations
-
 import json
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from mcdenoise.cli import main
 from mcdenoise.errors import InputError
 from mcdenoise.report.views import views
 from mcdenoise.results import Cell, Cost, Fit, Machine, Method, Results, Scene, Spread
@@ -52,57 +48,9 @@ def results() -> Results:
     )
 
 
-def test_a_spread_has_the_quartiles_of_its_values() -> None:
-    # They are interpolated between neighbours, as numpy and most others define them.
-    assert Spread.of([4.0, 1.0, 3.0, 2.0]) == Spread(2.5, 1.75, 3.25, 4)
-    assert Spread.of([7.0]) == Spread(7.0, 7.0, 7.0, 1)
-
-
 def test_written_files_are_read_back(results: Results, tmp_path: Path) -> None:
     results.write(tmp_path)
     assert Results.read(tmp_path) == results
-
-
-def test_results_of_before_are_read_too(results: Results, tmp_path: Path) -> None:
-    results.write(tmp_path)
-    content = json.loads((tmp_path / "results.json").read_text())
-    del content["notes"]
-    for cell in content["cells"]:
-        del cell["computing"]
-    (tmp_path / "results.json").write_text(json.dumps(content))
-    cells = [replace(cell, computing=None) for cell in results.cells]
-    assert Results.read(tmp_path) == replace(results, cells=cells, notes=[])
-
-
-def test_infinite_results_are_not_written(results: Results, tmp_path: Path) -> None:
-    broken = replace(results, cells=[Cell("plane", "ours", {"PSNR": float("inf")})])
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        broken.write(tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
-def test_missing_damaged_and_foreign_files_are_refused(results: Results, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"results\.json:"):
-        Results.read(tmp_path)
-    results.write(tmp_path)
-    path = tmp_path / "results.json"
-    text = path.read_text()
-    for damaged in (text[:-50], "[]", text.replace('"cells"', '"sells"'), text.replace('"median"', '"mean"')):
-        path.write_text(damaged)
-        with pytest.raises(InputError, match=r"results\.json:"):
-            Results.read(tmp_path)
-    path.write_text(text.replace('"version": 2', '"version": 3'))
-    with pytest.raises(InputError, match=r"version.*3"):
-        Results.read(tmp_path)
-
-
-def test_speed_is_pixels_over_the_time_in_memory(results: Results) -> None:
-    noisy, ours = results.cells
-    # Half a megapixel in two thousandths of a second.
-    assert results.megapixels_per_second(ours) == 250
-    assert results.megapixels_per_second(noisy) is None
-    assert results.failed
-    assert not replace(results, cells=[ours]).failed
 
 
 # Damage of every kind, in every place
@@ -194,26 +142,3 @@ def test_no_text_is_too_much(results: Results, tmp_path: Path) -> None:
     for scenes in ([], None, 1, "x"):
         path.write_text(json.dumps(json.loads(text) | {"scenes": scenes}))
         assert read_or_refused(tmp_path) is None
-
-
-@pytest.mark.timeout(60)
-@pytest.mark.parametrize("what", ["pipe", "device", "folder", "large"])
-def test_paths_that_are_no_files_are_refused_at_once(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "results.json"
-    if what == "pipe":
-        os.mkfifo(path)
-    elif what == "folder":
-        path.mkdir()
-    elif what == "large":
-        path.touch()
-        os.truncate(path, 1 << 40)
-    else:
-        path.symlink_to("/dev/zero")
-    with pytest.raises(SystemExit) as stop:
-        main(["benchmark", "-o", str(tmp_path)])
-    assert stop.value.code == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith(f"mcdenoise benchmark: {path}: expected the results of `mcdenoise benchmark`, found")
-    assert printed.count("\n") == 1

@@ -1,14 +1,9 @@
 """Exact features are told from noisy ones by their values."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 import torch
 from planes import HEIGHT, WIDTH, plane
 
-from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame
 from mcdenoise.sampling import has_centred_features, has_exact_features, has_scattered_features
 
@@ -41,10 +36,6 @@ def test_without_depth_or_normal_the_answer_is_no(missing: str) -> None:
     assert not has_exact_features(CENTRED.replace(**{missing: None}))
 
 
-def test_surfaces_that_are_nowhere_are_no_evidence() -> None:
-    assert not has_centred_features(CENTRED.replace(depth=torch.full_like(CENTRED.depth, torch.inf)))
-
-
 def test_normals_of_scattered_rays() -> None:
     assert not has_scattered_features(CENTRED)
     assert not has_scattered_features(CENTRED.replace(normal=None))
@@ -57,7 +48,3 @@ def test_normals_of_scattered_rays() -> None:
     edges[..., 10:30, 20:50] *= -1
     assert not has_scattered_features(CENTRED.replace(normal=edges))
     assert not has_scattered_features(Frame(CENTRED.color[..., :2, :2], normal=CENTRED.normal[..., :2, :2]))
-
-
-def test_the_features_of_a_rendered_frame(small_sequence: Path) -> None:
-    assert has_exact_features(open_sequence(small_sequence).frame(0))

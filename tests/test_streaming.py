@@ -1,7 +1,5 @@
 """A renderer that streams frames may rely on this: nothing of its own is kept, nothing bad is remembered."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import succeeds
+from refusals import refused
 from torch import Tensor, nn
 
-from mcdenoise import Denoiser, Frame, InputError, create_model
-from mcdenoise.cli import main
-from mcdenoise.data import open_sequence, read_exr
-from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_buffer
+from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise.data import read_exr
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 
 # A fast model with shipped weights.
 MODEL = "cascaded_v2_micro"
@@ -61,10 +60,8 @@ SHOTS: dict[str, Callable[[int], Frame]] = {
     "moving": scene,
     "still": lambda number: scene(number, still=True),
     "motion vectors": with_motion,
-    "without albedo": lambda number: scene(number, without=("albedo",)),
     "still without albedo": lambda number: scene(number, still=True, without=("albedo",)),
     "sky": lambda number: scene(number, still=True, sky=True),
-    "sky without albedo": lambda number: scene(number, still=True, sky=True, without=("albedo",)),
     "color": lambda number: Frame(color=scene(number).color),
 }
 FRAMES = 11
@@ -89,21 +86,11 @@ def in_one_place(frames: list[Frame]) -> Iterator[Frame]:
         yield place
 
 
-@pytest.mark.parametrize("anti_lag", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_a_renderer_may_write_every_frame_into_the_same_buffers(shot: list[Frame], anti_lag: bool) -> None:
-    expected = denoised(shot, Denoiser(MODEL, anti_lag=anti_lag))
-    denoiser = Denoiser(MODEL, anti_lag=anti_lag)
+def test_a_renderer_may_write_every_frame_into_the_same_buffers(shot: list[Frame]) -> None:
+    expected, denoiser = denoised(shot), Denoiser(MODEL)
     found = [denoiser(frame) for frame in in_one_place(shot)]
     # The images are not cloned: those that were handed out stay unchanged.
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
-
-
-def test_an_image_may_be_changed_where_it_is(shot: list[Frame]) -> None:
-    expected, denoiser = denoised(shot), Denoiser(MODEL)
-    for frame, image in zip(shot, expected, strict=True):
-        found = denoiser(frame)
-        assert torch.equal(found, image)
-        found.fill_(1e6)
 
 
 def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> None:
@@ -116,21 +103,6 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
         for one in (*output.stages.values(), output.image):
             one.fill_(1e6)
         assert torch.equal(frame.color, before)
-
-
-@pytest.mark.parametrize("without", [(), ("albedo",)])
-def test_an_image_is_an_ordinary_tensor(without: tuple[str, ...]) -> None:
-    denoiser = Denoiser(MODEL)
-    for number in range(2):
-        output = denoiser.output(scene(number, without=without))
-        for image in (denoiser(scene(number, without=without)), *output.stages.values(), output.image):
-            assert not image.is_inference()
-            assert not image.requires_grad
-            image.clamp_(0, 1)
-            image *= 2
-            scale = torch.ones((), requires_grad=True)
-            (image * scale).mean().backward()
-            torch.testing.assert_close(scale.grad, image.mean())
 
 
 @torch.inference_mode()
@@ -164,36 +136,26 @@ def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(mod
             torch.testing.assert_close(scale.grad, image.mean())
 
 
-@pytest.mark.parametrize("error", [RuntimeError, pytest.param(KeyboardInterrupt, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
-def test_a_network_that_fails_leaves_the_history_unchanged(name: str, error: type[BaseException]) -> None:
-    shot = [SHOTS[name](number) for number in range(FRAMES)]
+def test_a_network_that_fails_leaves_the_history_unchanged() -> None:
+    shot = [SHOTS["motion vectors"](number) for number in range(FRAMES)]
     expected, model = denoised(shot), create_model(MODEL, pretrained=True)
     denoiser, fails = Denoiser(model), False
 
     def fail(module: nn.Module, result: object) -> None:
         if fails:
-            raise error("out of memory")
+            raise RuntimeError("out of memory")
 
     model.register_forward_pre_hook(fail)
     for frame, image in zip(shot, expected, strict=True):
         fails = True
         for _ in range(2):
-            with pytest.raises(error):
+            with pytest.raises(RuntimeError):
                 denoiser(frame)
         fails = False
         assert torch.equal(denoiser(frame), image)
 
 
-def refused(action: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as error:
-        action()
-    assert "\n" not in str(error.value)
-    return str(error.value)
-
-
-@pytest.mark.parametrize("precision", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
-def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], precision: str) -> None:
+def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame]) -> None:
     window = shot[1].color[0, :, 9:12, 19:22].reshape(3, 9)
 
     def with_pixel(value: Tensor | float) -> list[Frame]:
@@ -201,20 +163,22 @@ def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame], pr
         color[0, :, 10, 20] = value
         return [shot[0], shot[1].replace(color=color), *shot[2:]]
 
-    expected = denoised(with_pixel(window[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(1)), Denoiser(MODEL, precision=precision))
-    for value in (3.4e38, 1e37, 1.1e16):
+    expected = denoised(with_pixel(window[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(1)))
+    for value in (3.4e38, 1.1e16):
         broken = with_pixel(value)
-        denoiser = Denoiser(MODEL, precision=precision)
+        denoiser = Denoiser(MODEL)
         for number, (frame, image) in enumerate(zip(broken, expected, strict=True)):
             torch.testing.assert_close(denoiser(frame), image)
             assert denoiser.report.replaced_pixels == (number == 1), value
 
 
-@pytest.mark.parametrize("albedo", [None, 0.0, *(pytest.param(a, marks=pytest.mark.slow) for a in (1e-3, 0.04, 1.0))])
-@pytest.mark.parametrize("where", [slice(10, 11), pytest.param(slice(10, 20), marks=pytest.mark.slow), slice(None)])
-def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where: slice, albedo: float | None) -> None:
+@pytest.mark.parametrize(
+    ("name", "albedo", "where"),
+    [("moving", None, slice(10, 11)), ("still", 0.0, slice(None)), ("motion vectors", 1e-3, slice(10, 20))],
+)
+def test_the_largest_radiance_that_is_one_stays_finite(name: str, where: slice, albedo: float | None) -> None:
     denoiser = Denoiser(MODEL)
-    for frame in shot:
+    for frame in [SHOTS[name](number) for number in range(FRAMES)]:
         color = frame.color.clone()
         color[..., where, where] = 1e16
         dark = None if albedo is None else torch.full_like(color, albedo)
@@ -226,7 +190,7 @@ def test_the_largest_radiance_that_is_one_stays_finite(shot: list[Frame], where:
             assert image.max() <= 1.01e16
 
 
-@pytest.mark.parametrize("name", ["moving", "still", "motion vectors", "without albedo", "color"])
+@pytest.mark.parametrize("name", ["moving", "still"])
 def test_images_that_are_not_finite_are_neither_returned_nor_remembered(name: str) -> None:
     shot = [SHOTS[name](number) for number in range(FRAMES)]
     expected, model = denoised(shot), create_model(MODEL, pretrained=True)
@@ -239,17 +203,9 @@ def test_images_that_are_not_finite_are_neither_returned_nor_remembered(name: st
         assert torch.equal(denoiser(frame), image)
 
 
-@pytest.mark.parametrize("alpha_min", [0.0, -1.0, 2.0, 1.0001, torch.nan, torch.inf])
-def test_a_weight_of_the_frame_that_cannot_be_is_refused_at_once(alpha_min: float) -> None:
-    assert "alpha_min: expected in (0, 1]" in refused(lambda: Denoiser(MODEL, alpha_min=alpha_min))
-    assert Denoiser(MODEL, alpha_min=1.0)(scene(0)).isfinite().all()
-
-
 def run(sequence: Path, out: Path, frames: str) -> tuple[np.ndarray, str]:
     """The last image of `mcdenoise denoise`, and what its report says of that frame's past."""
-    with pytest.raises(SystemExit) as stop:
-        main(["denoise", str(sequence), "-o", str(out), "--model", MODEL, "--frames", frames, "--full-float"])
-    assert stop.value.code == 0
+    succeeds("denoise", sequence, "-o", out, "--model", MODEL, "--frames", frames, "--full-float")
     number, done = list(json.loads((out / "denoise.json").read_text())["frames"].items())[-1]
     return read_exr(out / f"denoised{number}.exr")[0], done["reset"]
 
@@ -264,18 +220,3 @@ def test_motion_across_frames_that_were_not_chosen_is_not_followed(tmp_path: Pat
     followed, why = run(tmp_path / "motion", tmp_path / "followed", "0-1,3-4")
     assert not why
     assert not np.array_equal(followed, alone)
-
-
-def test_across_frames_that_were_not_chosen_positions_and_cameras_still_lead(
-    small_sequence: Path, tmp_path: Path
-) -> None:
-    expected, _ = run(small_sequence, tmp_path / "positions", "0,2")
-    sequence = open_sequence(small_sequence)
-    for number, frame in [(number, sequence.frame(number)) for number in sequence.numbers]:
-        moved = torch.full_like(frame.color[:, :2], 3.0)
-        write_buffer(small_sequence / "inputs", number, "motion", moved)
-        assert frame.position is not None
-        write_buffer(small_sequence / "inputs", number, "previous_position", frame.position + 0.5)
-    found, why = run(small_sequence, tmp_path / "motion", "0,2")
-    assert not why
-    assert np.array_equal(found, expected)

@@ -1,7 +1,5 @@
 """The way the threads of commands wait."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -31,13 +29,6 @@ def test_the_threads_of_commands_wait_without_spinning() -> None:
     assert found.get("GOMP_SPINCOUNT", "0") == "0"
 
 
-def test_settings_of_the_user_are_kept() -> None:
-    if not (found := policies(OMP_WAIT_POLICY="ACTIVE", GOMP_SPINCOUNT="7")):
-        pytest.skip("this torch has an OpenMP that does not tell its settings")
-    assert found["OMP_WAIT_POLICY"] == "ACTIVE"
-    assert found.get("GOMP_SPINCOUNT", "7") == "7"
-
-
 def test_the_number_of_threads_is_the_users(small_sequence: Path, tmp_path: Path) -> None:
     """Also if it is larger than that of the cores."""
     environment, more = {**os.environ, "OMP_NUM_THREADS": "1"}, 2 * (os.cpu_count() or 1) + 1
@@ -63,10 +54,3 @@ assert "torch" in sys.modules
 """
     environment = {name: value for name, value in os.environ.items() if name not in SAID}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-
-
-def test_the_package_has_no_other_names() -> None:
-    import mcdenoise
-
-    with pytest.raises(AttributeError, match="module 'mcdenoise' has no attribute 'denoiserr'"):
-        _ = mcdenoise.denoiserr

@@ -1,7 +1,5 @@
 """Runs attack cases: copies intact files, damages them, runs a command, and judges the result."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,19 +1,14 @@
 """Damage to files, by seed, and replacements of files."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from data.damage import flipped, flipped_header, noise, spliced, truncated
 
 Generator = np.random.Generator
-
-
-def truncated(g: Generator, content: bytes) -> bytes:
-    return content[: int(g.integers(0, len(content)))]
 
 
 def zeroed(g: Generator, content: bytes) -> bytes:
@@ -21,40 +16,6 @@ def zeroed(g: Generator, content: bytes) -> bytes:
     start = int(g.integers(0, len(content)))
     length = int(g.integers(1, 1 + max(1, len(content) // 2)))
     return content[:start] + bytes(min(length, len(content) - start)) + content[start + length :]
-
-
-def flipped(g: Generator, content: bytes) -> bytes:
-    """Flip one bit."""
-    damaged = bytearray(content)
-    damaged[int(g.integers(0, len(content)))] ^= 1 << int(g.integers(0, 8))
-    return bytes(damaged)
-
-
-def flipped_head(g: Generator, content: bytes) -> bytes:
-    """Flip some bits at the beginning, where the headers of formats are."""
-    damaged = bytearray(content)
-    for _ in range(int(g.integers(1, 5))):
-        damaged[int(g.integers(0, min(len(content), 400)))] ^= 1 << int(g.integers(0, 8))
-    return bytes(damaged)
-
-
-def swapped(g: Generator, content: bytes) -> bytes:
-    """Swap two ranges."""
-    a, b = sorted(int(each) for each in g.integers(0, len(content), 2))
-    length = min(int(g.integers(1, 64)), b - a, len(content) - b)
-    return (
-        content[:a]
-        + content[b : b + length]
-        + content[a + length : b]
-        + content[a : a + length]
-        + content[b + length :]
-    )
-
-
-def inserted(g: Generator, content: bytes) -> bytes:
-    """Insert random bytes in one place."""
-    start = int(g.integers(0, len(content) + 1))
-    return content[:start] + g.bytes(int(g.integers(1, 40))) + content[start:]
 
 
 TOKENS = [b"NaN", b"1e999", b"-1", b"null", b"[" * 3000, b'{"a":' * 3000, b'"', b"\xff", b"\0", b"{}", b"9" * 400]
@@ -74,28 +35,12 @@ def other_value(g: Generator, content: bytes) -> bytes:
     if not words:
         return flipped(g, content)
     word = words[int(g.integers(0, len(words)))]
-    values = [
-        b"null",
-        b"-1",
-        b"0",
-        b"1e300",
-        b'"x"',
-        b"[]",
-        b"{}",
-        b"true",
-        b"123456789012345678901",
-        b"0.5",
-        b'"\\ud800"',
-    ]
+    values = b'null -1 0 1e300 "x" [] {} true 123456789012345678901 0.5 "\\ud800"'.split()
     return content[: word.start()] + values[int(g.integers(0, len(values)))] + content[word.end() :]
 
 
-def noise(g: Generator, content: bytes) -> bytes:
-    return g.bytes(int(g.integers(1, 3000)))
-
-
 DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
-    *(truncated, zeroed, flipped, flipped_head, swapped, inserted, replaced_token, other_value, flipped, noise),
+    *(truncated, zeroed, flipped, flipped_header, spliced, replaced_token, other_value, flipped, noise),
 )
 
 

@@ -1,7 +1,5 @@
 """The tables of commands, readers and kinds of files; each new one needs an entry here."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import io
@@ -26,7 +24,9 @@ from world import HEIGHT, MODEL, TRAINING, WIDTH
 from mcdenoise.cli import COMMANDS as CLI
 from mcdenoise.cli import load_command, main
 from mcdenoise.data.exr import read_exr
+from mcdenoise.data.readers.bmfr import read_clean_features
 from mcdenoise.errors import InputError
+from mcdenoise.results import Results
 
 Meaning = Callable[[bytes], object]
 
@@ -169,32 +169,38 @@ COMMANDS = {
     "export": Command(
         f"export {MODEL}(weights=weights.safetensors) -o model.pt2", ("weights.safetensors",), exported, seconds=600
     ),
-    "reader exr": Command("reader exr shot/inputs/color0.exr", ("shot",), printed),
-    "reader sequence": Command("reader sequence shot", ("shot",), printed),
-    "reader layers": Command("reader sequence layers", ("layers",), printed),
-    "reader zip": Command("reader sequence frame0.zip", ("frame0.zip",), printed, requires="zarr"),
-    "reader hdr": Command("reader sequence still.hdr", ("still.hdr",), printed),
-    "reader png": Command("reader sequence still.png", ("still.png",), printed),
-    "reader camera_matrices": Command("reader camera_matrices shot/inputs/camera_matrices.h", ("shot",), printed),
-    "reader camera_path": Command("reader camera_path path.json", ("path.json",), printed),
-    "reader recipe": Command("reader recipe recipe.toml", ("recipe.toml",), printed),
-    "reader film": Command("reader film film.toml", ("film.toml", "shot"), printed),
-    "reader weights": Command("reader weights weights.safetensors", ("weights.safetensors",), printed),
-    "reader results": Command("reader results results", ("results",), printed),
-    "reader run": Command("reader run run", ("run",), printed),
-    "reader run_times": Command("reader run_times run_times.json", ("run_times.json",), printed),
-    "reader precision": Command("reader precision precision.json", ("precision.json",), printed),
-    "reader clean": Command("reader clean clean", ("clean",), printed),
-    "reader halves": Command("reader halves reference0.partial.npz", ("reference0.partial.npz",), printed),
-    "reader take": Command("reader take 0.take.npz", ("0.take.npz",), printed),
 }
 
 
-def read_sequence(path: Path) -> object:
-    from mcdenoise.data import open_sequence
+# What readers of the API read: the reader, where it has another name, and the file.
+READ = {
+    "exr": "exr shot/inputs/color0.exr",
+    "sequence": "sequence shot",
+    "layers": "sequence layers",
+    "zip": "sequence frame0.zip",
+    "hdr": "sequence still.hdr",
+    "png": "sequence still.png",
+    "camera_matrices": "camera_matrices shot/inputs/camera_matrices.h",
+    "camera_path": "camera_path path.json",
+    "recipe": "recipe recipe.toml",
+    "film": "film film.toml",
+    "weights": "weights weights.safetensors",
+    "results": "results results",
+    "run": "run run",
+    "run_times": "run_times run_times.json",
+    "precision": "precision precision.json",
+    "clean": "clean clean",
+    "halves": "halves reference0.partial.npz",
+    "take": "take 0.take.npz",
+}
+for name, line in READ.items():
+    needs = ("film.toml", "shot") if name == "film" else (line.split()[1].partition("/")[0],)
+    COMMANDS[f"reader {name}"] = Command(f"reader {line}", needs, printed, requires="zarr" if name == "zip" else "")
 
-    sequence = open_sequence(path)
-    return [dict(sequence.frame(number).items()) for number in sequence.numbers]
+
+def of(module: str, name: str, then: Callable[[Any], object] = lambda found: found) -> Callable[[Path], object]:
+    """Read a path with a function of a module, which is imported then."""
+    return lambda path: then(getattr(importlib.import_module(f"mcdenoise.{module}"), name)(path))
 
 
 def read_recipe(path: Path) -> object:
@@ -205,60 +211,12 @@ def read_recipe(path: Path) -> object:
     return [recipe.data, recipe.validation, recipe.credits, recipe.chosen([])]
 
 
-def read_film(path: Path) -> object:
-    from mcdenoise.film import read_film
-
-    return read_film(path)
-
-
-def read_weights(path: Path) -> object:
-    from mcdenoise.models import load_weights
-
-    return load_weights(path).state_dict()
-
-
 def read_run(path: Path) -> object:
     from mcdenoise.train import RunFolder
 
     run = RunFolder(path)
     run.rewind(2)
     return run.errors()
-
-
-def read_run_times(path: Path) -> object:
-    from mcdenoise import budget
-
-    return budget._read(path)
-
-
-def read_precision(path: Path) -> object:
-    from mcdenoise.models import _precision
-
-    return _precision._read(path)
-
-
-def read_matrices(path: Path) -> object:
-    from mcdenoise.data.camera_matrices import read_camera_matrices
-
-    return read_camera_matrices(path)
-
-
-def read_path(path: Path) -> object:
-    from mcdenoise.data.camera_path import load_camera_path
-
-    return load_camera_path(path)
-
-
-def read_results(path: Path) -> object:
-    from mcdenoise.results import Results
-
-    return Results.read(path)
-
-
-def read_clean(path: Path) -> object:
-    from mcdenoise.data.readers.bmfr import read_clean_features
-
-    return read_clean_features(path, 0)
 
 
 def read_halves(path: Path) -> object:
@@ -268,28 +226,25 @@ def read_halves(path: Path) -> object:
     return [halves.mean(), halves.noise(), halves.spp]
 
 
-def read_take(path: Path) -> object:
-    from mcdenoise.data.shards import open_shard
-
-    shard = open_shard(path)
-    return dict(shard.header), {name: array.tobytes() for name, array in shard.read().items()}
-
-
 READERS: dict[str, Callable[[Path], object]] = {
     "exr": read_exr,
-    "sequence": read_sequence,
-    "camera_matrices": read_matrices,
-    "camera_path": read_path,
+    "sequence": of("data", "open_sequence", lambda found: [dict(found.frame(n).items()) for n in found.numbers]),
+    "camera_matrices": of("data.camera_matrices", "read_camera_matrices"),
+    "camera_path": of("data.camera_path", "load_camera_path"),
     "recipe": read_recipe,
-    "film": read_film,
-    "weights": read_weights,
-    "results": read_results,
+    "film": of("film", "read_film"),
+    "weights": of("models", "load_weights", lambda model: model.state_dict()),
+    "results": Results.read,
     "run": read_run,
-    "run_times": read_run_times,
-    "precision": read_precision,
-    "clean": read_clean,
+    "run_times": of("budget", "_read"),
+    "precision": of("models._precision", "_read"),
+    "clean": lambda path: read_clean_features(path, 0),
     "halves": read_halves,
-    "take": read_take,
+    "take": of(
+        "data.shards",
+        "open_shard",
+        lambda shard: (dict(shard.header), {name: array.tobytes() for name, array in shard.read().items()}),
+    ),
 }
 
 
@@ -367,14 +322,7 @@ KINDS = {
     "color": Kind(
         "shot/inputs/color0.exr",
         pixels,
-        {
-            "denoise": 130,
-            "inspect": 60,
-            "evaluate model": 60,
-            "reader exr": 100,
-            "train": 8,
-            "benchmark": 12,
-        },
+        {"denoise": 130, "inspect": 60, "evaluate model": 60, "reader exr": 100, "train": 8, "benchmark": 12},
     ),
     "color of the second frame": Kind(
         "shot/inputs/color1.exr",

@@ -1,20 +1,17 @@
 """Code that a file, a folder or a package brings along: it runs only where the caller names it, and breaks nothing."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from commands import run
 from safetensors.torch import save_file
 
-from mcdenoise.cli import main
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model, describe_weights, load_weights, save_weights
 
@@ -48,28 +45,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[[str], tuple[int, str]]:
-    """Run a command in this process: exit status and stderr."""
-
-    def call(line: str) -> tuple[int, str]:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as stop:
-            main(line.split())
-        return int(stop.value.code or 0), capsys.readouterr().err
-
-    return call
-
-
 def write(path: Path, architecture: str, settings: dict[str, Any]) -> Path:
     save_file({"a": torch.zeros(1)}, path, {"architecture": architecture, "settings": json.dumps(settings)})
     return path
 
 
 @pytest.mark.parametrize("architecture", HOSTILE)
-def test_a_weights_file_names_no_code(
-    architecture: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
-) -> None:
+def test_a_weights_file_names_no_code(architecture: str, here: Path, small_sequence: Path) -> None:
     settings = {
         key: value.format(touched=here / "touched") if isinstance(value, str) else value
         for key, value in HOSTILE[architecture].items()
@@ -79,7 +61,7 @@ def test_a_weights_file_names_no_code(
         load_weights(file)
     (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "{small_sequence}"\nmodel = "{file}"\n')
     for line in LINES:
-        status, said = run(line.format(shot=small_sequence, file=file))
+        status, _, said = run(line.format(shot=small_sequence, file=file))
         assert not (here / "touched").exists(), line
         assert status == 2, (line, said)
         assert "Traceback" not in said
@@ -88,29 +70,25 @@ def test_a_weights_file_names_no_code(
 
 @pytest.mark.parametrize("model", ["os:system(command=touch touched)", "beside.py:make", "beside:make"])
 @pytest.mark.parametrize("key", ["model", "start_from"])
-def test_a_recipe_and_a_manifest_name_no_code(
-    model: str, key: str, here: Path, run: Callable[[str], tuple[int, str]]
-) -> None:
+def test_a_recipe_and_a_manifest_name_no_code(model: str, key: str, here: Path) -> None:
     (here / "recipe.toml").write_text(f'[train]\n{key} = "{model}"\nsteps = 1\n[[data]]\nseeds = "0"\n')
     (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "shot"\nmodel = "{model}"\n')
     for line in ("train --recipe recipe.toml -o out", "film film.toml -o out"):
-        status, said = run(line)
+        status, _, said = run(line)
         assert (status, len(said.splitlines())) == (2, 1), said
         assert not (here / "touched").exists()
         assert not (here / "out").exists()
 
 
 @pytest.mark.parametrize("key", ["blender_python", "workers"])
-def test_a_recipe_names_no_program_and_no_machine(key: str, here: Path, run: Callable[[str], tuple[int, str]]) -> None:
+def test_a_recipe_names_no_program_and_no_machine(key: str, here: Path) -> None:
     (here / "recipe.toml").write_text(f'[train]\nsteps = 1\n[[data]]\nseeds = "0"\n{key} = "/bin/true"\n')
-    status, said = run("train --recipe recipe.toml -o out")
+    status, _, said = run("train --recipe recipe.toml -o out")
     assert status == 2
     assert key in said
 
 
-def test_weights_of_ones_own_model_are_loaded_with_its_factory(
-    here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
-) -> None:
+def test_weights_of_ones_own_model_are_loaded_with_its_factory(here: Path, small_sequence: Path) -> None:
     (here / "folder").mkdir()
     (here / "folder/own.py").write_text(
         "from mcdenoise.models import create_model\n\n\ndef make(width=4):\n"
@@ -138,21 +116,22 @@ EXITS = {
 }
 
 
-@pytest.mark.parametrize("source", EXITS.values(), ids=EXITS)
 @pytest.mark.parametrize(
-    "line",
+    ("exits", "line"),
     [
-        "denoise {shot} -o out --model own.py:make",
-        "evaluate {shot} --model own.py:make",
-        "export own.py:make -o out.pt2 --buffers color",
-        "stability own.py:make",
+        ("at its import", "denoise {shot} -o out --model own.py:make"),
+        ("in a step", "denoise {shot} -o out --model own.py:make"),
+        ("in its factory", "evaluate {shot} --model own.py:make"),
+        ("by no exception", "evaluate {shot} --model own.py:make"),
+        ("in a step", "export own.py:make -o out.pt2 --buffers color"),
+        ("with a word", "stability own.py:make"),
     ],
 )
 def test_a_model_that_exits_ends_no_command_with_success(
-    line: str, source: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
+    line: str, exits: str, here: Path, small_sequence: Path
 ) -> None:
-    (here / "own.py").write_text(source)
-    status, said = run(line.format(shot=small_sequence))
+    (here / "own.py").write_text(EXITS[exits])
+    status, _, said = run(line.format(shot=small_sequence))
     assert status in (1, 2), said
     assert "Traceback" not in said
     assert not list(here.glob("out*/*.exr"))
@@ -164,10 +143,8 @@ def test_a_model_that_exits_ends_no_command_with_success(
     "name",
     ["builtins:exit", "os:abort", "sys:exit", "os:_exit", "subprocess:run(args=touch)", "torch:rand", "torch:nn"],
 )
-def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(
-    name: str, here: Path, small_sequence: Path, run: Callable[[str], tuple[int, str]]
-) -> None:
-    status, said = run(f"denoise {small_sequence} -o out --model {name}")
+def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(name: str, here: Path, small_sequence: Path) -> None:
+    status, _, said = run(f"denoise {small_sequence} -o out --model {name}")
     assert (status, said.count("\n")) == (2, 1), said
     assert not (here / "out").exists()
 
@@ -211,7 +188,7 @@ def test_modules_of_the_working_folder_are_not_imported(line: str, here: Path, s
     assert not (here / "hostile").exists()
 
 
-def test_native_code_beside_a_scene_is_not_loaded(here: Path, run: Callable[[str], tuple[int, str]]) -> None:
+def test_native_code_beside_a_scene_is_not_loaded(here: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     from mcdenoise.scenes.render.tracer import Tracer
 

@@ -1,7 +1,5 @@
 """Commands that are killed at random moments, or run twice at once."""
 
-from __future__ import annotations
-
 import signal
 
 import numpy as np

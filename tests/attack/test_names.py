@@ -1,7 +1,5 @@
 """Names that are difficult for terminals, tables, patterns and file systems, in arguments and in folders."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -1,8 +1,5 @@
 """Outputs that exist already or cannot be written to, and full disks."""
 
-from __future__ import annotations
-
-import json
 import os
 import subprocess
 from collections.abc import Callable
@@ -143,24 +140,4 @@ def test_a_folder_of_another_user(attacker: Attacker, name: str) -> None:
             ended = attacker.run(command.command, folder, user=NOBODY)
             problem = attacker.judge(name, folder, ended, same=False)
             failed += attacker.count("outputs", problem, f"{name}, {place} of mode {mode:o}", folder)
-    assert not failed, "\n".join(failed)
-
-
-@pytest.mark.attack
-def test_an_earlier_longer_run(attacker: Attacker) -> None:
-    """Older images are kept and named in a warning, whatever an earlier report lists: they may be hours of work."""
-    failed = []
-    for number, listed in enumerate([["denoised7.exr"], [], ["denoised7.exr", "denoised8.exr"], ["../out7.exr"]]):
-        folder = attacker.fresh(("shot", "out"))
-        for name in ("denoised7.exr", "denoised8.exr"):
-            (folder / "out" / name).write_bytes((attacker.world / "out/denoised0.exr").read_bytes())
-        report = json.loads((folder / "out/denoise.json").read_text())
-        report["frames"] |= {str(7 + i): {**report["frames"]["0"], "file": name} for i, name in enumerate(listed)}
-        (folder / "out/denoise.json").write_text(json.dumps(report))
-        ended = attacker.run(COMMANDS["denoise"].command, folder)
-        problem = attacker.lines("denoise", ended)
-        older = ["denoised7.exr", "denoised8.exr"]
-        if not problem and not all((folder / "out" / name).is_file() and name in ended.err for name in older):
-            problem = f"not kept, or not named: {ended.err}"
-        failed += attacker.count("outputs", problem, f"earlier run {number}", folder)
     assert not failed, "\n".join(failed)

@@ -1,7 +1,5 @@
 """The intact files: a shot in several layouts, weights, results, an interrupted training run, and so on."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The checks of numerical stability: the ops pass, and what is unstable fails."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,15 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+from commands import refuses, run
 from torch import Tensor
 
-from mcdenoise.check import stability
 from mcdenoise.check.cases import OPS, Op
-from mcdenoise.check.stability import Check, check_case, check_denoiser, check_model, check_op, long_runs, summarize
 from mcdenoise.check.stability import _ops as op_checks
-from mcdenoise.cli import main
-from mcdenoise.errors import InputError
-from mcdenoise.models import list_models, pretrained_models
+from mcdenoise.check.stability import check_case, check_denoiser, check_model, check_op, long_runs
 from mcdenoise.ops import _backend, _op, kernel_conv
 from mcdenoise.ops._op import op, plain
 
@@ -50,10 +45,12 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
     ids=lambda op: op.name,
 )
 def test_every_op_is_stable(op: Op) -> None:
-    checks = list(check_op(op, (torch.float32,)))
+    # Of the ordinary cases, every third: in float64 all of them equal their equation.
+    cases = tuple(case for i, case in enumerate(op.cases) if i % 3 == 0 or case.kind != "ordinary")
+    checks = list(check_op(replace(op, cases=cases), (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
     for what in ("forward", "gradient"):
-        assert {check.case for check in checks if check.what == what} == {case.name for case in op.cases}
+        assert {check.case for check in checks if check.what == what} == {case.name for case in cases}
 
 
 def test_sums_in_half_precision_fail() -> None:
@@ -98,13 +95,6 @@ def test_a_nan_gradient_fails() -> None:
     assert {"albedo 0"} <= found["gradient"]
 
 
-def test_a_result_that_does_not_scale_fails() -> None:
-    def shifted(image: Tensor) -> Tensor:
-        return BY_NAME["downsample"].function(image) + 1e-6
-
-    assert failures(like("downsample", shifted)).keys() == {"exposure"}
-
-
 def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = like("kernel_splat", lambda image, kernel, **given: kernel_conv(image, kernel, **given))
     others = tuple(op for op in OPS if op.name != "kernel_splat")
@@ -145,12 +135,6 @@ def test_a_model_is_stable() -> None:
     checks = list(check_model("cascaded_v2_micro", (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
     assert {check.what for check in checks} == {"finite", "gradient", "forward", "exposure"}
-
-
-def test_a_denoiser_is_stable() -> None:
-    checks = list(check_denoiser("cascaded_v2_micro", (torch.float16,)))
-    assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
-    assert {check.what for check in checks} == {"valid", "contained", "refused", "exposure"}
 
 
 def test_derivatives_of_a_denoiser_in_black_pixels(tmp_path: Path) -> None:
@@ -202,51 +186,9 @@ def test_long_runs() -> None:
     assert runs["light off, with anti-lag", "float32"].ghost == 1
 
 
-def test_the_worst_check_comes_first() -> None:
-    def check(case: str, error: float, passed: bool = True) -> Check:
-        return Check("op", case, "float32", "", "forward", error, 1.0, 7.0, passed, "" if passed else "wrong")
-
-    (summary,) = summarize([check("a", 0.5), check("b", 0.1, False), check("c", 0.9)])
-    assert (summary.checks, summary.worst.case, summary.condition) == (3, "b", 7.0)
-    assert [failed.case for failed in summary.failed] == ["b"]
-
-
-def test_the_checks_by_default_and_by_name() -> None:
-    names = [group.name for group in stability.groups()]
-    known = [op.name for op in op_checks.select()]
-    assert names[: len(known)] == known
-    models = names[len(known) :]
-    assert models[-1] == "long runs"
-    assert {f"Denoiser, {name}" for name in pretrained_models()} < set(models)
-    # Trainable models are also checked by themselves, other models only in a denoiser.
-    assert [name for name in models if name not in list_models()] == [
-        *(f"Denoiser, {name}" for name in models if name in list_models()),
-        "long runs",
-    ]
-    assert [group.name for group in stability.groups(["demodulate"])] == ["demodulate"]
-    named = [group.name for group in stability.groups(None, ["cascaded_v2_tiny"])]
-    assert named == ["cascaded_v2_tiny", "Denoiser, cascaded_v2_tiny"]
-    for arguments, message in (
-        ((["sharpen"], None), "expected .* found sharpen"),
-        ((["demodulat"], None), "found no demodulat; did you mean demodulate"),
-        ((None, ["resnet18"]), "model 'resnet18': expected one of"),
-    ):
-        with pytest.raises(InputError, match=message):
-            stability.groups(*arguments)
-    with pytest.raises(InputError, match="found float8"):
-        stability.parse_dtypes(["float32", "float8"])
-
-
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as stop:
-        main(["stability", *map(str, arguments)])
-    out, err = capsys.readouterr()
-    return int(stop.value.code or 0), out, err
-
-
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path: Path) -> None:
     path = tmp_path / "stability.json"
-    status, out, _ = run(capsys, "demodulate", "--dtypes", "float16", "--json", path)
+    status, out, _ = run("stability", "demodulate", "--dtypes", "float16", "--json", path)
     assert status == 0
     assert out.splitlines()[-1].endswith(" checks, 0 failed")
     content = json.loads(path.read_text())
@@ -256,10 +198,10 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert content["long_runs"] == []
 
 
-def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path) -> None:
     path = tmp_path / "own.py"
     path.write_text("def own():\n    return lambda color, normal: color * (normal.abs().sum(1, keepdim=True) - 0.05)\n")
-    status, out, _ = run(capsys, "--models", f"{path}:own", "--dtypes", "float32")
+    status, out, _ = run("stability", "--models", f"{path}:own", "--dtypes", "float32")
     assert status == 1
     rows = {}
     for case in ("depth 0 in some rows", "normal 0 in some rows", "albedo 93 in some rows"):
@@ -267,38 +209,6 @@ def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path, capsys: pyt
     assert [case for case, row in rows.items() if "FAILED" in row] == ["normal 0 in some rows"]
 
 
-def test_the_command_names_backends_that_cannot_run(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = replace(BY_NAME["kernel_conv"], cases=BY_NAME["kernel_conv"].cases[:1])
-    monkeypatch.setattr(op_checks, "select", lambda names: [small])
-    monkeypatch.setattr(_backend, "_missing", lambda: "is not there")
-    status, out, _ = run(capsys, "kernel_conv", "--dtypes", "float32")
-    assert status == 0
-    assert "not run: backend:" in out
-
-
-def test_an_exceeded_bound_exits_with_1(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(color: Tensor, albedo: Tensor, *, floor: float = 0.04) -> Tensor:
-        return color / albedo
-
-    monkeypatch.setattr(op_checks, "OPS", (like("demodulate", broken),))
-    status, out, _ = run(capsys, "demodulate", "--dtypes", "float32", "--json", tmp_path / "a.json")
-    assert status == 1
-    assert "FAILED" in out
-    assert not json.loads((tmp_path / "a.json").read_text())["passed"]
-
-
 @pytest.mark.parametrize("arguments", [("sharpen",), ("--models", "unet"), ("--dtypes", "float8"), ("--frames", "0")])
-def test_bad_usage_exits_with_2(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
-    status, _, err = run(capsys, *arguments)
-    assert status == 2
-    assert err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_the_whole_command(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capsys)
-    assert status == 0, out
+def test_bad_usage_exits_with_2(arguments: tuple[str, ...]) -> None:
+    refuses("stability", *arguments)

@@ -1,7 +1,5 @@
 """Ways in which files are damaged, seeded, and a process that reads them with little memory and says what it found."""
 
-from __future__ import annotations
-
 import json
 import struct
 import subprocess
@@ -85,14 +83,7 @@ def noise(g: Generator, content: bytes) -> bytes:
 
 
 DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
-    truncated,
-    flipped,
-    flipped_header,
-    spliced,
-    numbers,
-    absurd_size,
-    channel_types,
-    noise,
+    *(truncated, flipped, flipped_header, spliced, numbers, absurd_size, channel_types, noise),
 )
 
 

@@ -1,7 +1,5 @@
 """Files and folders that are whole under their final names, whatever happens while they are written."""
 
-from __future__ import annotations
-
 import json
 import os
 import stat
@@ -13,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from mcdenoise.data import files
-from mcdenoise.data.files import atomic_path, held, new_folder, write_json, write_text
+from mcdenoise.data.files import held, new_folder, write_json, write_text
 from mcdenoise.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and locks")
@@ -73,25 +71,6 @@ def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(tmp_path: Pa
         end(alive)
 
 
-def test_new_temporary_files_are_kept(tmp_path: Path) -> None:
-    (tmp_path / ".mcdenoise-0123.tmp").write_text("not locked yet")
-    files._swept.clear()
-    write_text(tmp_path / "whole.txt", "text")
-    assert (tmp_path / ".mcdenoise-0123.tmp").exists()
-
-
-def test_two_that_write_the_same_do_not_meet(tmp_path: Path) -> None:
-    path = tmp_path / "file.txt"
-    # Process numbers are no help: two containers may have the same ones.
-    with atomic_path(path) as first, atomic_path(path) as second:
-        assert first != second
-        first.write_text("first")
-        second.write_text("second")
-    assert path.read_text() == "first"
-    with new_folder(tmp_path / "a") as one, new_folder(tmp_path / "b") as other:
-        assert one != other
-
-
 def test_a_new_folder_may_be_an_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "link").symlink_to("empty")
@@ -111,16 +90,6 @@ def test_a_new_folder_may_be_an_empty_one(tmp_path: Path, monkeypatch: pytest.Mo
             pass
 
 
-@pytest.mark.parametrize("suffix", ["", ".txt", "." + "x" * 100])
-def test_long_names(tmp_path: Path, suffix: str) -> None:
-    name = "n" * (255 - len(suffix)) + suffix
-    write_text(tmp_path / name, "text")
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-    with pytest.raises(InputError, match="cannot be written"):
-        write_text(tmp_path / f"n{name}", "text")
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
 def test_a_file_has_the_permissions_of_one_that_is_written_plainly(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
@@ -130,47 +99,6 @@ def test_a_file_has_the_permissions_of_one_that_is_written_plainly(tmp_path: Pat
         os.umask(before)
     ours, plain = (stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("ours", "plain"))
     assert ours == plain == 0o640
-
-
-def test_a_file_is_synced_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[str] = []
-    fsync, replace = os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("fsync"), fsync(handle)))
-    monkeypatch.setattr(os, "replace", lambda *paths: (done.append("replace"), replace(*paths)))
-    write_text(tmp_path / "file.txt", "text")
-    assert done == ["fsync", "replace"]
-
-
-def test_checking_whether_a_path_is_writable_changes_nothing(tmp_path: Path) -> None:
-    (tmp_path / "there").write_text("before")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "loop").symlink_to("loop")
-    for name in ("there", "new"):
-        files.check_writable(tmp_path / name)
-    for name in ("folder", "loop", "nowhere/new", "there/new"):
-        with pytest.raises(InputError, match=f"{name}: "):
-            files.check_writable(tmp_path / name)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "loop", "there"]
-    assert (tmp_path / "there").read_text() == "before"
-
-
-def test_a_link_is_followed_and_its_own_suffix_decides_the_format(tmp_path: Path) -> None:
-    (tmp_path / "video.mp4").symlink_to("latest")
-    with atomic_path(tmp_path / "video.mp4") as temporary:
-        assert temporary.suffix == ".mp4"
-        temporary.write_text("frames")
-    assert (tmp_path / "latest").read_text() == "frames"
-    assert (tmp_path / "video.mp4").is_symlink()
-
-
-def test_a_file_that_cannot_be_removed_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    (tmp_path / "folder").mkdir()
-    files.remove(tmp_path / "file")
-    files.remove(tmp_path / "file")
-    with pytest.raises(InputError, match="folder:"):
-        files.remove(tmp_path / "folder")
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
 def test_json_has_no_nan(tmp_path: Path) -> None:

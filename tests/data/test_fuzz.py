@@ -5,8 +5,6 @@ library that writes; or refused. Files are read by ``fuzz_worker.py``, in proces
 a gigabyte of memory; the generator is seeded, so that a failure can be seen again.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable
@@ -153,19 +151,12 @@ def with_checksums(content: bytes) -> bytes:
 
 
 OTHER_DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
-    truncated,
-    flipped,
-    flipped_header,
-    spliced,
-    extreme_numbers,
-    absurd_sides,
-    absurd_sides,
-    noise,
+    *(truncated, flipped, flipped_header, spliced, extreme_numbers, absurd_sides, absurd_sides, noise),
 )
 
 
-def fuzz(tmp_path: Path, intact: dict[str, bytes], count: int, seed: int) -> None:
-    g, files = np.random.default_rng(seed), {}
+def test_damaged_images(tmp_path: Path, intact: dict[str, bytes]) -> None:
+    g, files, count = np.random.default_rng(0), {}, 160
     for i in range(count):
         name = sorted(intact)[i % len(intact)]
         damages = DAMAGES if name.endswith(".exr") else OTHER_DAMAGES
@@ -202,28 +193,7 @@ def test_a_hollow_file_takes_no_memory(tmp_path: Path, intact: dict[str, bytes])
     assert all(found.values())
 
 
-def test_damaged_images(tmp_path: Path, intact: dict[str, bytes]) -> None:
-    fuzz(tmp_path, intact, 160, seed=0)
-
-
-MATRICES_TEXT = (
-    b"{",
-    b"}",
-    b",",
-    b";",
-    b"=",
-    b"[",
-    b"]",
-    b"nan",
-    b"1e999",
-    b"-",
-    b"0x",
-    b"//",
-    b"/*",
-    b"\0",
-    b"\xff",
-    b"9" * 400,
-)
+MATRICES_TEXT = (*b"{ } , ; = [ ] nan 1e999 - 0x // /* \0 \xff".split(b" "), b"9" * 400)
 
 
 def damaged_matrices(g: Generator, content: bytes) -> bytes:
@@ -247,15 +217,11 @@ def damaged_matrices(g: Generator, content: bytes) -> bytes:
     return content
 
 
-def fuzz_matrices(tmp_path: Path, count: int, seed: int) -> None:
-    g, folder = np.random.default_rng(seed), tmp_path / "matrices"
+def test_damaged_camera_matrices(tmp_path: Path) -> None:
+    g, folder, count = np.random.default_rng(0), tmp_path / "matrices", 60
     cameras = CameraMatrices(g.normal(size=(5, 4, 4)), np.full((5, 2), 0.5), 0.01, 0.25)
     write_camera_matrices(tmp_path / "camera_matrices.h", cameras, "scene")
     content = (tmp_path / "camera_matrices.h").read_bytes()
     found = outcomes(folder, {f"{i:05d}.h": damaged_matrices(g, content) for i in range(count)})
     assert_clear(folder, found)
     assert sum(bool(outcome) for outcome in found.values()) > count / 3
-
-
-def test_damaged_camera_matrices(tmp_path: Path) -> None:
-    fuzz_matrices(tmp_path, 60, seed=0)

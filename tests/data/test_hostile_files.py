@@ -3,10 +3,7 @@
 The damaged ones are those of ``test_fuzz.py``.
 """
 
-from __future__ import annotations
-
 import os
-import resource
 import shutil
 import struct
 from pathlib import Path
@@ -16,11 +13,11 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 from damage import assert_clear, outcomes_of
+from refusals import full_disk
 
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import open_sequence
-from mcdenoise.data.camera_matrices import MATRICES
-from mcdenoise.data.exr import read_exr, write_exr
+from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError, printable
 
 SIZE = 11, 13
@@ -137,12 +134,6 @@ def test_names_of_every_kind_are_read_written_and_spelled_out(tmp_path: Path) ->
         assert f"{printable(name)}1.RGB" in found[f"part{i}.exr"]
 
 
-def test_a_thousand_layers(tmp_path: Path) -> None:
-    names = ["R", "G", "B", *(f"light {i}.{each}" for i in range(1000) for each in "RGB")]
-    sequence = open_sequence([write(tmp_path / "shot.exr", part(names))])
-    np.testing.assert_array_equal(sequence.frame(0).color[0, 0], pixels())
-
-
 def test_a_text_in_latin_1_is_unchanged(tmp_path: Path) -> None:
     """Renderers on old systems write it so: the library that writes here knows nothing but UTF-8."""
     content = write(tmp_path / "shot.exr", part("RGB", owner="M?ller", extra=3)).read_bytes()
@@ -159,52 +150,6 @@ def test_a_text_in_latin_1_is_unchanged(tmp_path: Path) -> None:
     assert oiio.ImageInput.open(str(written)).spec().format == "half"
 
 
-@pytest.fixture
-def bmfr(tmp_path: Path) -> Path:
-    folder = tmp_path / "shot"
-    folder.mkdir()
-    for stem in ("color", "albedo", "shading_normal"):
-        write(folder / f"{stem}0.exr", part("RGB"))
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("channels", "found"),
-    [
-        ({each: pixels(kind=np.uint32) for each in "RGB"}, "found whole numbers"),
-        ({each: pixels() for each in ("Y", "RY", "BY")}, "found luminance and chroma"),
-    ],
-)
-def test_bmfr_refuses_files_without_color(bmfr: Path, channels: dict[str, np.ndarray], found: str) -> None:
-    write(bmfr / "albedo0.exr", part(channels))
-    with pytest.raises(InputError, match=found):
-        open_sequence(bmfr)
-
-
-def test_bmfr_refuses_a_buffer_of_other_pixels(bmfr: Path) -> None:
-    write(bmfr / "albedo0.exr", part("RGB", dataWindow=window(3, -2)))
-    with pytest.raises(InputError, match=r"albedo0\.exr: .*pixels at -2, 3"):
-        open_sequence(bmfr)
-    # All of them there is a crop, and well.
-    for path in bmfr.iterdir():
-        write(path, part("RGB", dataWindow=window(3, -2)))
-    assert open_sequence(bmfr).size == SIZE
-
-
-@pytest.mark.parametrize("name", ["camera.json", MATRICES])
-@pytest.mark.parametrize("kind", ["link", "pipe", "device", "folder"])
-@pytest.mark.timeout(60)
-def test_an_unreadable_file_is_not_reported_as_missing(bmfr: Path, name: str, kind: str) -> None:
-    if kind == "pipe":
-        os.mkfifo(bmfr / name)
-    elif kind == "folder":
-        (bmfr / name).mkdir()
-    else:
-        (bmfr / name).symlink_to("nothing" if kind == "link" else "/dev/zero")
-    with pytest.raises(InputError, match=name):
-        open_sequence(bmfr)
-
-
 def test_the_screen_shows_names_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = [f"{name}.{each}" for name in ("[/x]", "[red]\x1b[2J", "[/x].Denoising Albedo") for each in "RGB"]
     write(tmp_path / "shot.exr", part(["R", "G", "B", *names, "[red]\n.Depth.Z"]))
@@ -215,7 +160,7 @@ def test_the_screen_shows_names_as_they_are(tmp_path: Path, capsys: pytest.Captu
     assert "\x1b" not in shown
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_any_values_are_read_and_written_without_a_warning(tmp_path: Path, seed: int) -> None:
     """Infinite ones and none at all too; more of them in some layers than in others, and in some all alike."""
     g, size = np.random.default_rng(seed), (40, 48)
@@ -248,9 +193,9 @@ def test_any_values_are_read_and_written_without_a_warning(tmp_path: Path, seed:
     ("name", "kind"),
     [("pic.exr", "half"), ("pic.png", "uint8"), ("pic.tif", "float"), ("pic.hdr", "float"), ("pic.pfm", "float")],
 )
-@pytest.mark.parametrize("size", [(70, 90), (6, 8)])
-def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: str, size: tuple[int, int]) -> None:
+def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: str) -> None:
     """The libraries say nothing of what they still hold back when the disk is full, of a small file all of it."""
+    size = (70, 90) if kind == "half" else (6, 8)
     noise = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
     file = oiio.ImageOutput.create(name)
     assert file.open(str(tmp_path / name), oiio.ImageSpec(size[1], size[0], 3, kind))
@@ -261,34 +206,8 @@ def test_a_full_disk_is_told_to_the_last_byte(tmp_path: Path, name: str, kind: s
     # The length is that of the file as it will be.
     length = sequence.write(out, 0, noise).stat().st_size
     (out / name).unlink()
-    unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
     rooms = {100, length // 2, length - 5000, length - 100, length - 1, *range(1, length, max(length // 40, 1))}
     for room in sorted(room for room in rooms if 0 < room < length):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (room, unlimited[1]))
-        try:
-            with pytest.raises(InputError, match="cannot be written"):
-                sequence.write(out, 0, noise)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, unlimited)
+        with full_disk(room), pytest.raises(InputError, match="cannot be written"):
+            sequence.write(out, 0, noise)
         assert not list(out.iterdir()), room
-
-
-def test_whole_numbers_beside_a_text_in_latin_1_stay(tmp_path: Path) -> None:
-    channels = {"id": pixels(kind=np.uint32), **{each: pixels() for each in "RGB"}}
-    content = write(tmp_path / "shot.exr", part(channels, owner="M?ller")).read_bytes()
-    (tmp_path / "shot.exr").write_bytes(content.replace(b"M?ller", b"M\xfcller"))
-    sequence, out = open_sequence([tmp_path / "shot.exr"]), tmp_path / "out"
-    out.mkdir()
-    path = sequence.write(out, 0, np.zeros((*SIZE, 3), np.float32))
-    written = path.read_bytes()
-    assert b"M\xfcller" in written
-    path.write_bytes(written.replace(b"M\xfcller", b"M?ller"))
-    np.testing.assert_array_equal(OpenEXR.File(str(path)).channels()["id"].pixels, channels["id"].pixels)
-
-
-def test_an_attribute_with_a_name_in_latin_1_is_read_as_text(tmp_path: Path) -> None:
-    path = write(tmp_path / "shot.exr", part("RGB", gr_n=3))
-    path.write_bytes(path.read_bytes().replace(b"gr_n\0", b"gr\xfcn\0"))
-    for metadata in (read_exr(path)[2], open_sequence([path]).metadata(0)):
-        assert metadata["grün"] == 3
-        write_exr(tmp_path / "again.exr", np.zeros((*SIZE, 3)), "RGB", metadata=metadata)

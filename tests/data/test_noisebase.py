@@ -3,8 +3,6 @@
 What is expected follows from the equations of the format, in float64.
 """
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 import warnings
@@ -16,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import Generator, flipped, spliced, truncated
 
-from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data import open_sequence
 from mcdenoise.data.readers import noisebase
 from mcdenoise.data.readers.noisebase import open_noisebase
 from mcdenoise.data.sequences import Sequence
@@ -147,7 +144,7 @@ def test_buffers_and_frames_that_are_found(opened: Sequence) -> None:
     assert f"cropped from {WHOLE[1]} x {WHOLE[0]}" in words["view_projection"]
 
 
-@pytest.mark.parametrize("number", range(FRAMES))
+@pytest.mark.parametrize("number", [0, FRAMES - 1])
 def test_means_and_variance_are_those_of_the_samples(opened: Sequence, number: int) -> None:
     frame, known = opened.frame(number), arrays(number)
     samples = decode(known["color"])
@@ -168,12 +165,6 @@ def test_means_and_variance_are_those_of_the_samples(opened: Sequence, number: i
     assert opened.frame(number, buffers={"albedo"}).samples is None
 
 
-def test_radiance_comes_back_from_its_bytes() -> None:
-    """The encoder of this page is one: a byte of 255 is the error of half a step."""
-    radiance = np.random.default_rng(0).uniform(0.1, 10, (3, 1000))
-    assert np.abs(decode(encode(radiance)) - radiance).max() < 10 * np.exp(5.5 / 256) / 255 / 2 + 1e-6
-
-
 def test_positions_are_seen_at_their_pixels(tmp_path: Path) -> None:
     """Each at its own place within a pixel, with one sample in the middle of it."""
     content = arrays(2, samples=1)
@@ -190,75 +181,6 @@ def test_positions_are_seen_at_their_pixels(tmp_path: Path) -> None:
     depth = frame.depth[0, 0].numpy()
     assert np.isinf(depth[:3]).all()
     np.testing.assert_allclose(depth[3:], clip[3:, :, 3], rtol=1e-6)
-
-
-def test_a_frame_that_is_no_crop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(noisebase, "_RENDERED", (1080, 1920))
-    content = arrays(0)
-    content["crop_offset"] = np.array([28, 0], np.int32)
-    whole = np.diag([WHOLE[1] / SIZE[1], WHOLE[0] / SIZE[0], 1, 1])
-    # The camera of these pixels alone; the offset is for what is cut off afterwards.
-    matrix = content["view_proj_mat"].astype(np.float64)
-    clip = matrix @ whole
-    clip[:, 0] += matrix[:, 3] * (WHOLE[1] / SIZE[1] - 2 * CROP[1] / SIZE[1] - 1)
-    clip[:, 1] -= matrix[:, 3] * (WHOLE[0] / SIZE[0] - 2 * CROP[0] / SIZE[0] - 1)
-    content["view_proj_mat"] = clip.astype(np.float32)
-    sequence = open_sequence(write(tmp_path / "frame0.zip", content))
-    assert "view_projection" in sequence.buffers
-    flip = np.diag([1, -1, 1, 1])
-    np.testing.assert_allclose(sequence.frame(0).view_projection[0], content["view_proj_mat"] @ flip, rtol=1e-6)
-
-
-def test_a_camera_of_something_else_is_told(tmp_path: Path) -> None:
-    content = arrays(0) | {"view_proj_mat": np.eye(4, dtype=np.float32)}
-    sequence = open_sequence(write(tmp_path / "frame0.zip", content))
-    assert "view_proj_mat" in sequence.warnings[0]
-    assert not sequence.buffers & {"view_projection", "depth"}
-    assert sequence.frame(0).view_projection is None
-
-
-def test_frames_are_written_and_read_back(opened: Sequence, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    image = np.random.default_rng(0).random((*SIZE, 3)).astype(np.float16).astype(np.float32)
-    path = opened.write(tmp_path / "out", 1, image)
-    assert path.name in ("frame0001.exr", "scene_0001.exr")
-    pixels, channels, _ = read_exr(path)
-    assert channels == ["R", "G", "B"]
-    np.testing.assert_array_equal(pixels, image)
-    with pytest.raises(InputError, match="--output-layer"):
-        opened.write(tmp_path, 1, image, output_layer="clean")
-
-
-def test_any_chunks_and_no_compression(tmp_path: Path) -> None:
-    content = arrays(0)
-    chunks = {"color": (4, 7, 5, 3), "position": (2, 9, 24, 4), "reference": (1, 20, 11)}
-    expected = open_sequence(write(tmp_path / "frame0.zip", content)).frame(0)
-    found = open_sequence(write(tmp_path / "other0.zip", content, **chunks)).frame(0)
-    for name, values in found.items():
-        np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-6, atol=1e-7, err_msg=name)
-
-
-def test_arrays_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
-    folder = frames_of(tmp_path / "scene")
-    write(folder / "frame0003.zip", {k: v for k, v in arrays(0).items() if k != "normal"})
-    with pytest.raises(InputError, match=r"frame0003.zip:"):
-        open_sequence(folder)
-    assert open_sequence(folder, "0-2").numbers == [0, 1, 2]
-    write(folder / "walk0000.zip", arrays(0))
-    with pytest.raises(InputError, match="one sequence, found files of 2 names"):
-        open_sequence(folder)
-    both = [training_set(tmp_path / "a.zip"), training_set(tmp_path / "b.zip")]
-    with pytest.raises(InputError, match="one sequence, found 2"):
-        open_sequence(both)
-    with pytest.raises(InputError, match="--map"):
-        open_sequence(both[0], mapping=["albedo=diffuse"])
-
-
-def test_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write(tmp_path / "frame0.zip", arrays(0))
-    monkeypatch.setitem(__import__("sys").modules, "zarr", None)
-    with pytest.raises(InputError, match=r"mcdenoise\[noisebase\]"):
-        open_sequence(path)
 
 
 def changed(path: Path, target: Path, change: dict[str, bytes | None]) -> Path:
@@ -315,8 +237,9 @@ def test_compressed_bombs_and_false_sizes_are_refused_before_memory_is_allocated
         assert len(str(told.value)) < 700 + len(str(copy)), name
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-@pytest.mark.parametrize("name", ["color/.zarray", "color/0.0.0.0"])
+@pytest.mark.parametrize(
+    ("name", "method"), [("color/.zarray", zipfile.ZIP_DEFLATED), ("color/0.0.0.0", zipfile.ZIP_LZMA)]
+)
 def test_a_member_that_is_larger_than_it_says(tmp_path: Path, name: str, method: int) -> None:
     """Sizes and checksum are those of its first bytes; what follows are zeros."""
     path = write(tmp_path / "frame0.zip", arrays(0))
@@ -342,9 +265,10 @@ def test_a_member_that_is_larger_than_it_says(tmp_path: Path, name: str, method:
 UNPICKLED = "cos\nmkdir\n(V{path}\ntR."
 
 
-@pytest.mark.parametrize("name", ["normal", "stranger"])
-@pytest.mark.parametrize("dtype", ["|O", "<f2"])
-@pytest.mark.parametrize("codec", ["filters", "compressor"])
+@pytest.mark.parametrize(
+    ("name", "dtype", "codec"),
+    [("normal", "|O", "filters"), ("normal", "<f2", "compressor"), ("stranger", "|O", "compressor")],
+)
 def test_nothing_is_unpickled_and_nothing_is_written_elsewhere(
     tmp_path: Path, name: str, dtype: str, codec: str
 ) -> None:
@@ -362,31 +286,3 @@ def test_nothing_is_unpickled_and_nothing_is_written_elsewhere(
         open_sequence(hostile).frame(0)
     assert {each.name for each in tmp_path.iterdir()} == {"frame0.zip", "hostile0.zip"}
     assert not (tmp_path.parent / "outside").exists()
-
-
-def test_damaged_zips(tmp_path: Path) -> None:
-    """Cut, flipped and spliced; bytes of chunks too, beyond the reach of the zip's own checksums."""
-    g: Generator = np.random.default_rng(0)
-    path = write(tmp_path / "frame0.zip", arrays(0))
-    content, refused, count = path.read_bytes(), {}, 40
-    with zipfile.ZipFile(path) as file:
-        names = file.namelist()
-        entries = {name: file.read(name) for name in names}
-    damages = (truncated, flipped, spliced)
-    for i in range(count):
-        target, damage = tmp_path / f"{i}.zip", damages[i % 3]
-        if i % 2:
-            target.write_bytes(damage(g, content))
-        else:
-            name = names[int(g.integers(len(names)))]
-            changed(path, target, {name: damage(g, entries[name]) if entries[name] else b""})
-        with warnings.catch_warnings():
-            # zipfile warns of names that come twice.
-            warnings.simplefilter("ignore", UserWarning)
-            try:
-                sequence = open_sequence(target)
-                sequence.frame(sequence.numbers[0])
-            except InputError as error:
-                refused[target] = str(error)
-    assert len(refused) > count / 2
-    assert all(message.isprintable() and str(target) in message for target, message in refused.items())

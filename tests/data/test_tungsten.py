@@ -1,7 +1,5 @@
 """One file a buffer, with the variance and the halves of each, as Tungsten writes them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Videos: as many frames as pictures, the same pictures, and no file that is not whole."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -60,19 +58,6 @@ def test_colors_are_those_that_the_file_states(tmp_path: Path, color: tuple[int,
         assert abs(int(frame.to_ndarray(format="yuv420p")[16, 16]) - luma) <= 1
 
 
-@pytest.mark.parametrize(
-    ("size", "shown"),
-    [((1, 1), (2, 2)), ((3, 7), (4, 8)), ((45, 80), (46, 80)), ((2, 8192), (2, 4096)), ((8200, 50), (4096, 24))],
-)
-def test_sizes(tmp_path: Path, size: tuple[int, int], shown: tuple[int, int]) -> None:
-    write_video(tmp_path / "a.mp4", [gradient(*size)] * 3)
-    frames = decode(tmp_path / "a.mp4")
-    assert [frame.shape for frame in frames] == [(*shown, 3)] * 3
-    if size == (45, 80):
-        # Nothing is stretched: the row that is repeated is the last one.
-        assert np.abs(frames[0][:45].astype(float) - gradient(*size)).mean() < 3
-
-
 def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, [gradient(16, 16)] * 2)
@@ -91,19 +76,6 @@ def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(InputError, match="cannot be written"):
         write_video(tmp_path / "missing" / "a.mp4", [gradient(16, 16)])
-
-
-@pytest.mark.parametrize("rate", [0.0, -1.0, 1e9, float("nan"), float("inf")])
-def test_frame_rates_that_cannot_be(tmp_path: Path, rate: float) -> None:
-    with pytest.raises(InputError, match="frames per second: expected 1 to 1000"):
-        write_video(tmp_path / "a.mp4", [gradient(16, 16)], rate)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_without_the_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install 'mcdenoise\[preview\]'"):
-        write_video(tmp_path / "a.mp4", [gradient(16, 16)])
 
 
 _LIMITED = """
@@ -134,25 +106,3 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
     command = [sys.executable, "-c", _LIMITED, str(tmp_path / "a.mp4")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout) == (0, "done\n"), result.stderr
-
-
-_MEMORY = """
-import resource, sys
-from pathlib import Path
-import numpy as np
-from mcdenoise.data.video import write_video
-first = np.random.default_rng(0).integers(0, 255, (360, 640, 3), dtype=np.uint8)
-def peak(count):
-    write_video(Path(sys.argv[1]), (np.roll(first, number, 1) for number in range(count)))
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-before = peak(30)
-print((peak(210) - before) / first.nbytes)
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="reads the peak of memory through the POSIX resource usage")
-def test_memory_does_not_grow_with_the_number_of_pictures(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", _MEMORY, str(tmp_path / "a.mp4")]
-    result = subprocess.run(command, capture_output=True, text=True, check=True)
-    # Held together, the other 180 pictures would take the memory of so many.
-    assert float(result.stdout) < 18

@@ -1,7 +1,5 @@
 """Functions that workers call: they leave marks in a folder, and may kill their own process."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -1,8 +1,5 @@
 """Rendering on a Ray cluster of two nodes, one of which is lost: as on one machine."""
 
-from __future__ import annotations
-
-import json
 import threading
 import time
 from collections.abc import Iterator
@@ -81,21 +78,3 @@ def test_generate(cluster: Any, tmp_path: Path) -> None:
     lost.join(60)
     assert not lost.is_alive()
     assert same(tmp_path / "quiet", tmp_path / "out")
-
-
-def test_render(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Paths are relative to the folder that the driver works in.
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.xml").write_text(
-        '<scene version="3.0.0"><integrator type="path"/><shape type="sphere"/><emitter type="constant"/></scene>'
-    )
-    cameras = [{"position": [0, 0.1 * k, 5], "look_at": [0, 0, 0]} for k in range(6)]
-    (tmp_path / "path.json").write_text(json.dumps({"fov": 40, "frames": cameras}))
-    options = ["scene.xml", "--camera-path", "path.json", "--reference-spp", "64", *SMALL]
-    assert not run("render", *options, "-o", "quiet")
-    lost = lose(cluster, tmp_path / "out", "inputs/color0.exr")
-    assert not run("render", *options, "-o", "out", "--workers", cluster[0].address)
-    lost.join(60)
-    assert same(tmp_path / "quiet", tmp_path / "out")
-    both = [json.loads((tmp_path / name / "inputs/camera.json").read_text()) for name in ("quiet", "out")]
-    assert both[0] == both[1]

@@ -63,44 +63,11 @@ def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> Non
     run.add("advancing", die_at_first, tmp_path, "advancing", MOST_LOSSES + 1, **advances)
     run.on(LocalEngine(2))
     assert run.failed.pop("hopeless").endswith(f"{MOST_LOSSES} times in a row")
-    assert run.failed == {
-        "failing": "RuntimeError: two lines",
-        "strange": "Strange: 7 and 8",
-        "exits": "SystemExit: 0",
-    }
+    assert run.failed == {"failing": "RuntimeError: two lines", "strange": "Strange: 7 and 8", "exits": "SystemExit: 0"}
     assert set(run.answers) == {"quiet", "lost", "advancing"}
     assert set(follow.answers) == {"next"}
     # Nobody tries more often than that.
     assert not (tmp_path / "hopeless").exists()
-
-
-def test_tasks_start_by_rank() -> None:
-    class Inline:
-        def __init__(self) -> None:
-            self.started: list[object] = []
-            self.done: dict[Hashable, Done] = {}
-
-        def free_slots(self) -> int:
-            return 1
-
-        def submit(self, function: object, *arguments: object) -> Hashable:
-            self.started.append(arguments[0])
-            self.done[len(self.started)] = Done(0)
-            return len(self.started)
-
-        def finished(self, seconds: float) -> dict[Hashable, Done]:
-            found, self.done = self.done, {}
-            return found
-
-        def close(self) -> None:
-            self.started.append("closed")
-
-    run, last, engine = Run(), Run(), Inline()
-    last.add("first", len, "first", rank=0)
-    run.add("a", len, "a", rank=2)
-    run.add("b", len, "b", rank=1, then=tuple(last.tasks))
-    run.on(engine)
-    assert engine.started == ["b", "first", "a", "closed"]
 
 
 def test_workers_are_a_number_or_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:

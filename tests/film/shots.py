@@ -1,7 +1,5 @@
 """Small shots, that a camera walks past a wall in, films of them, and an engine that makes films in this process."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Hashable
 from pathlib import Path
 from typing import Any
@@ -84,11 +82,7 @@ def frame(number: int, width: int, height: int, seed: int) -> Frame:
     noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
     normal = torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width) / 1.04**0.5
     return Frame(
-        color=albedo * noise,
-        albedo=albedo[None],
-        normal=normal,
-        depth=depth[None, None],
-        position=position[None],
+        color=albedo * noise, albedo=albedo[None], normal=normal, depth=depth[None, None], position=position[None]
     )
 
 

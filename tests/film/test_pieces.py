@@ -1,29 +1,24 @@
 """Shots in pieces: everything is made once, with enough frames before it, wherever one begins again."""
 
-from __future__ import annotations
-
 import math
 import random
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from shots import frame, pixels, write_shot
-from torch import nn
 from torch.utils import _pytree as pytree
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
 from mcdenoise.film.work import Order, make, scan
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import Recurrent, create_model, frames_remembered, list_models
+from mcdenoise.models import create_model, frames_remembered, list_models
 from mcdenoise.shot import ShotSettings
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_every_missing_frame_is_made_once_with_the_frames_before_it(seed: int) -> None:
     g = random.Random(seed)
     numbers = sorted(g.sample(range(200), g.randint(1, 120)))
@@ -45,13 +40,6 @@ def test_every_missing_frame_is_made_once_with_the_frames_before_it(seed: int) -
         for number in piece.wanted:
             before = numbers.index(number) - places[0]
             assert before >= (math.inf if overlap is None else overlap) or places[0] == 0
-
-
-def test_a_piece_resumes_at_its_beginning_where_that_is_near() -> None:
-    (near,) = cut(range(100), range(7, 100), length=0, overlap=4)
-    assert near.numbers[0] == 0
-    (far,) = cut(range(100), range(50, 100), length=0, overlap=4)
-    assert (far.numbers[0], far.wanted[0]) == (46, 50)
 
 
 def test_pieces_do_not_depend_on_what_is_missing() -> None:
@@ -77,26 +65,6 @@ def test_an_average_remembers_what_its_alpha_says() -> None:
     assert frames_remembered(create_model("bmfr", alpha_min=0.5, second_alpha=0.5, taa_alpha=0.5), 0.01) == 3 * 7
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1.0, -1.0, math.nan])
-def test_a_tolerance_that_is_none(tolerance: float) -> None:
-    with pytest.raises(InputError, match="tolerance:"):
-        frames_remembered(create_model("noisy"), tolerance)
-
-
-def test_unknown_methods_remember_an_unknown_number_of_frames() -> None:
-    class Own(nn.Module):
-        needs = create_model("noisy").needs
-
-        def forward(self, frame: Any, state: Any = None) -> Any:
-            raise NotImplementedError
-
-    assert frames_remembered(Own(), 0.01) is None
-    assert frames_remembered(Recurrent(create_model("noisy")), 0.01) is None
-    own = Own()
-    own.persistence = 0.5  # type: ignore[assignment]
-    assert frames_remembered(own, 0.01) == 7
-
-
 @pytest.mark.parametrize("name", list_models())
 def test_a_method_that_keeps_a_state_says_how_long(name: str) -> None:
     model = create_model(name)
@@ -117,10 +85,7 @@ def long_shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     ("settings", "joint"),
-    [
-        (ShotSettings("accumulated", alpha_min=0.4), 1e-2),
-        (ShotSettings("noisy"), 1e-2),
-    ],
+    [(ShotSettings("accumulated", alpha_min=0.4), 1e-2), (ShotSettings("noisy"), 1e-2)],
     ids=lambda value: str(getattr(value, "model", value)),
 )
 def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(

@@ -1,7 +1,5 @@
 """A film on a Ray cluster, of which a node is lost."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A film gives what `mcdenoise denoise` gives, makes nothing twice, and loses nothing but what is damaged."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -11,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import run as command
+from commands import succeeds
 from shots import Inline, edit, pixels, same, write_manifest, write_shot
 
-from mcdenoise.cli import main
 from mcdenoise.data.files import held
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, FilmResult, read_film, run_film, write_page
+from mcdenoise.film import Film, FilmResult, read_film, run_film
 from mcdenoise.film.record import read_records
 from mcdenoise.shot import ShotSettings
 
@@ -38,9 +37,7 @@ def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> 
     assert result.complete
     assert result.made == 9
     for name, folder in shots.items():
-        with pytest.raises(SystemExit) as stop:
-            main(["denoise", str(folder), "-o", str(tmp_path / name), "--model", MODEL])
-        assert not stop.value.code
+        succeeds("denoise", folder, "-o", tmp_path / name, "--model", MODEL)
         assert same(tmp_path / "out" / name, tmp_path / name)
         film, alone = (
             json.loads((each / "denoise.json").read_text()) for each in (tmp_path / "out" / name, tmp_path / name)
@@ -53,24 +50,6 @@ def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> 
             assert {**own, "milliseconds": 0, "beside": 0} == {**about, "milliseconds": 0, "beside": 0}
     # Nothing else is there.
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".film", "film.json", "film_pictures", *shots}
-
-
-def test_it_says_what_it_did(shots: dict[str, Path], tmp_path: Path) -> None:
-    result = run(shots, tmp_path / "out")
-    about = json.loads((tmp_path / "out/film.json").read_text())
-    assert (about["complete"], about["frames_made"]) == (True, 9)
-    assert [shot["name"] for shot in about["shots"]] == ["s0", "s1"]
-    assert about["shots"][1]["frames"] == [0, 1, 2, 3, 4]
-    assert about["shots"][1]["settings"] == {"model": MODEL, "device": "cpu", "precision": "auto", **SETTINGS}
-    assert about["shots"][0]["resets"] == {"0": "first frame"}
-    assert about["shots"][0]["failed"] == []
-    page = write_page(Film([], tmp_path / "out"), result).read_text()
-    for picture in re.findall(r'src="([^"]+)"', page):
-        assert (tmp_path / "out" / picture).is_file()
-    assert page.count("<h2 ") == 3
-
-
-SETTINGS = {"anti_lag": True, "preview_fps": 24.0}
 
 
 def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Path) -> None:
@@ -163,16 +142,12 @@ def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, dam
     assert (tmp_path / "out/s1/denoise.json").exists()
 
 
-def test_the_table_of_what_failed_and_status_1(
-    shots: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mcdenoise.cli.film.open_engine", lambda workers, **options: Inline())
+@pytest.mark.usefixtures("inline")
+def test_the_table_of_what_failed_and_status_1(shots: dict[str, Path], tmp_path: Path) -> None:
     (shots["s1"] / "inputs/color2.exr").write_bytes(b"")
     manifest = write_manifest(tmp_path / "film.toml", {**shots, "gone": tmp_path / "nowhere"}, model=MODEL)
-    with pytest.raises(SystemExit) as stop:
-        main(["film", str(manifest), "-o", str(tmp_path / "out")])
-    assert stop.value.code == 1
-    printed = capsys.readouterr().out
+    status, printed, _ = command("film", manifest, "-o", tmp_path / "out")
+    assert status == 1
     assert re.search(r"gone +│ all +│ .*nowhere: expected a folder", printed)
     assert re.search(r"s1 +│ 2 +│ .*color2.exr", printed)
     assert "  s0: 4 frames, 4 made" in printed

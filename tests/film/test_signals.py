@@ -1,7 +1,5 @@
 """Signals in every phase of a film, and of rendering by several processes: one line, nothing half-written."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys
@@ -11,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from shots import pixels, write_manifest, write_shot
-from test_interruption import OBEYING, RENDER, WORDS, end, started
+from test_interruption import OBEYING, end, started
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals are those of Linux")
 FRAMES = 60
@@ -57,18 +55,3 @@ def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
 )
 def test_a_signal_ends_a_film_with_one_line(tmp_path: Path, phase: str, number: signal.Signals) -> None:
     interrupt(tmp_path, phase, number)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-@pytest.mark.parametrize("number", WORDS, ids=lambda each: each.name)
-@pytest.mark.parametrize("seconds", [0.0, 3.0])
-def test_any_signal_ends_generate_with_workers(tmp_path: Path, number: signal.Signals, seconds: float) -> None:
-    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    options = ["--assets", "none", "--seeds", "0-9", "--frames", "4", "--workers", "2", *RENDER]
-    process = started(OBEYING, "generate", "-o", tmp_path / "out", *options, folder=tmp_path)
-    assert process.stdout is not None
-    process.stdout.readline()
-    time.sleep(seconds)
-    end(process, number, "generate", lines=10)
-    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".mcdenoise-")]

@@ -4,8 +4,6 @@ A way takes a denoiser and the frames of a shot, and returns digests by name. It
 the digests prove that a change of the code changes no image.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

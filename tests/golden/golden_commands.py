@@ -1,7 +1,5 @@
 """What commands print and write for the files of renderers, and the losses of a short training."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -4,8 +4,6 @@ The shots are computed with arithmetic and uniform random numbers in float64, an
 machine rounds differently, inputs change by a unit roundoff, for which the bounds account.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -6,8 +6,6 @@ and everything is computed in that precision. These are measured for new images,
 the file again only if the images of a method are meant to change; ``make.py NAME ...`` does so for some methods.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

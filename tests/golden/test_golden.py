@@ -4,8 +4,6 @@
 ``golden_cases.ALLOWED``. Another test shows that small errors exceed them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,9 +1,6 @@
 """Metrics and the training loss: known answers, and the equations of the paper written out."""
 
-from __future__ import annotations
-
 import math
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +10,6 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from mcdenoise.metrics import (
-    UncomputableError,
     displayed,
     flip_hdr,
     flip_srgb,
@@ -81,14 +77,6 @@ def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
     return (reference + 0.1 * torch.randn_like(reference)).clamp_min(0), reference
 
 
-def test_ssim_of_flat_images_written_out() -> None:
-    # For flat images only the means count: (2 a b + K1^2) / (a^2 + b^2 + K1^2).
-    first, second = torch.full((1, 3, 11, 12), 0.2), torch.full((1, 3, 11, 12), 0.4)
-    a, b = (float(displayed(x).flatten()[0]) for x in (first, second))
-    assert ssim_srgb(first, second).item() == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-4)
-    assert ssim_srgb(first, first).tolist() == [1]
-
-
 def test_ssim_is_that_of_scikit_image() -> None:
     structural_similarity = pytest.importorskip("skimage.metrics").structural_similarity
     image, reference = noisy_pair(31, 40)
@@ -105,11 +93,6 @@ def test_ssim_is_that_of_scikit_image() -> None:
     # Measured: 1e-8 in double precision, 1e-7 in single.
     assert ssim_srgb(image.double(), reference.double()).item() == pytest.approx(expected, abs=1e-6)
     assert ssim_srgb(image, reference).item() == pytest.approx(expected, abs=1e-5)
-
-
-def test_ssim_needs_a_window() -> None:
-    with pytest.raises(UncomputableError, match=r"11 x 11 .*10 x 20"):
-        ssim_srgb(torch.rand(1, 3, 10, 20), torch.rand(1, 3, 10, 20))
 
 
 def test_ssim_has_a_gradient() -> None:
@@ -148,25 +131,6 @@ def test_hdr_flip_sees_errors_that_a_display_clamps() -> None:
     assert flip_hdr(dimmer, reference).item() > 0.05
     # Exposures depend on the reference alone, so errors beyond all of them are finite too.
     assert 0 < flip_hdr(torch.full_like(reference, 1e9), reference).item() <= 1
-
-
-def test_hdr_flip_of_darkness() -> None:
-    pytest.importorskip("flip_evaluator")
-    images = torch.rand(2, 3, 16, 16)
-    black = images.clone()
-    black[1] = 0
-    with pytest.raises(UncomputableError, match="black"):
-        flip_hdr(images, black)
-    # One bright pixel suffices, and a flat reference has one exposure.
-    black[1, 2, 3, 4] = 2e-5
-    assert flip_hdr(images, black).isfinite().all()
-    assert flip_hdr(images, torch.full_like(images, 0.5)).isfinite().all()
-
-
-def test_flip_without_its_package_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(UncomputableError, match=r"FLIP needs flip-evaluator.*mcdenoise\[peers\]"):
-        flip_srgb(torch.rand(1, 3, 4, 4), torch.rand(1, 3, 4, 4))
 
 
 def test_temporal_rmse_written_out() -> None:
@@ -212,37 +176,3 @@ def test_leading_axes_are_batch_axes(metric: Callable[[Tensor, Tensor], Tensor])
     for b in range(2):
         for t in range(4):
             torch.testing.assert_close(together[b, t], metric(images[b, t], references[b, t]))
-
-
-@pytest.mark.parametrize("metric", [smape_linear, relmse_linear, rmse_linear, flip_srgb, flip_hdr])
-def test_no_error_is_zero(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
-    images = torch.rand(2, 3, 4, 5) * 100
-    assert metric(images, images).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.complex64], ids=str)
-@pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
-def test_integers_and_complex_numbers_are_rejected(
-    metric: Callable[[Tensor, Tensor], Tensor], dtype: torch.dtype
-) -> None:
-    """Differences of unsigned integers would overflow."""
-    image = torch.rand(1, 2, 3, 12, 12)
-    with pytest.raises(TypeError, match=rf"image: .*{dtype}"):
-        metric(image.to(dtype), image)
-    with pytest.raises(TypeError, match=rf"reference: .*{dtype}"):
-        metric(image, image.to(dtype))
-
-
-@pytest.mark.parametrize("metric", [*IMAGE_METRICS, *CLIP_METRICS])
-def test_shapes_must_agree(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
-    with pytest.raises(ValueError, match=r"reference: .*\(1, 2, 3, 4, 6\)"):
-        metric(torch.rand(1, 2, 3, 4, 5), torch.rand(1, 2, 3, 4, 6))
-    with pytest.raises(ValueError, match=r"reference:"):
-        metric(torch.rand(4, 5), torch.rand(4, 5))
-
-
-@pytest.mark.parametrize("metric", CLIP_METRICS)
-def test_one_frame_has_no_temporal_error(metric: Callable[[Tensor, Tensor], Tensor]) -> None:
-    for shape in ((1, 1, 3, 4, 5), (3, 4, 5)):
-        with pytest.raises(ValueError, match=r"clip:"):
-            metric(torch.rand(shape), torch.rand(shape))

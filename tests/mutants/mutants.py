@@ -1,7 +1,5 @@
 """Small wrong edits of the ops and of what models are made of, each of which the checks must notice."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -5,8 +5,6 @@ ops, ``mcdenoise gradcheck`` and ``mcdenoise stability`` run for the op that it 
 Edits whose text is not in the file exactly once are stale: mend the list. Exits with 1 if an edit survives or is stale.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,14 +1,11 @@
 """The U-Net: its scales, and what is faster on a CPU."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.nn import Head, UNet
-from mcdenoise.nn._cpu import convolved_in_float32
 
 WIDTH = 8
 
@@ -43,41 +40,6 @@ def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
     for a, b in zip(trained, inferred, strict=True):
         assert len(b.unique()) > 20
         assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
-def test_shortcuts_of_inference_change_no_convolution_by_more_than_rounding(dtype: torch.dtype) -> None:
-    """Sums of ``n`` products in two orders differ by at most ``2 gamma_n`` times the sum of their absolute values.
-
-    ``gamma_n = n u / (1 - n u)`` with the ``u`` of float32 (Higham 2002, Sec. 3.1). The second convolution multiplies
-    the difference of the first by its weights. A result in bfloat16 is rounded once more, by up to its ``u``.
-    """
-    torch.manual_seed(0)
-    net = UNet(4, [WIDTH] * 4).to(dtype=dtype, memory_format=torch.channels_last)
-    entering: list[tuple[nn.Module, Tensor]] = []
-    blocks = [*net.encoder, *net.decoder]
-    for block in blocks:
-        block.register_forward_pre_hook(lambda block, inputs: entering.append((block, inputs[0].detach().clone())))
-    with torch.no_grad():
-        net(torch.randn(1, 4, 21, 34).to(dtype))
-    unit = torch.finfo(torch.float32).eps / 2
-    rounding = 0.0 if dtype == torch.float32 else torch.finfo(dtype).eps / 2
-    # The list grows while they are called again.
-    for block, x in entering[: len(blocks)]:
-        trained = block(x.clone()).detach()
-        with torch.no_grad():
-            inferred = block(x.clone())
-        magnitude, bound = x.double().abs(), torch.zeros_like(x, dtype=torch.float64)
-        for layer in block:
-            if isinstance(layer, nn.Conv2d):
-                weight, bias = layer.weight.detach().double().abs(), layer.bias.detach().double().abs()
-                gamma = (count := weight[0].numel() + 1) * unit / (1 - count * unit)
-                carried = nn.functional.conv2d(bound, weight, None, layer.stride, layer.padding)
-                # The sum of all absolute values is also an upper bound of the results.
-                magnitude = nn.functional.conv2d(magnitude + bound, weight, bias, layer.stride, layer.padding)
-                bound = carried + (2 * gamma + 2 * rounding) * magnitude
-        assert ((trained.double() - inferred.double()).abs() <= bound).all()
-        assert bound.max() < (1e-3 if dtype == torch.float32 else 2) * trained.max()
 
 
 def test_shortcuts_of_training_change_no_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,35 +82,6 @@ def test_unet_gives_three_scales_of_any_size(levels: int, half: bool) -> None:
             assert Head(unet, scale, 3)(feature, size).shape == (2, 3, *size)
 
 
-def test_a_head_predicts_the_pixels_that_a_feature_of_half_the_resolution_stands_for() -> None:
-    unet = UNet(1, [2] * 3, half=True)
-    head = Head(unet, 0, 1)
-    with torch.no_grad():
-        for parameter in head.parameters():
-            parameter.zero_()
-        # The middle of the kernel: each of two by two pixels is a multiple of the first feature.
-        head.weight[:, 0, 1, 1] = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    predicted = head(torch.tensor([[[[1.0, 10.0]], [[7.0, 7.0]]]]), (2, 3))
-    assert predicted.tolist() == [[[[1, 2, 10], [3, 4, 30]]]]
-
-
-def test_unet_sees_what_it_is_given_at_coarser_scales() -> None:
-    torch.manual_seed(0)
-    unet = UNet(5, [4] * 4, coarse_channels=2)
-    image = torch.rand(1, 5, 13, 22)
-    coarse = [torch.rand(1, 2, *size, requires_grad=True) for size in ((7, 11), (4, 6), (2, 3))]
-    features = unet(image, coarse)
-    assert [tuple(f.shape[-2:]) for f in features] == [(13, 22), (7, 11), (4, 6)]
-    for gradient in torch.autograd.grad(features[0].sum(), coarse):
-        assert gradient.abs().sum() > 0
-
-
-@pytest.mark.parametrize(("levels", "half", "lowest"), [(0, False, 3), (2, False, 3), (1, True, 2)])
-def test_unet_needs_a_level_for_each_scale(levels: int, half: bool, lowest: int) -> None:
-    with pytest.raises(ValueError, match=rf"widths: .*{levels}"):
-        UNet(5, [4] * levels, half=half)
-
-
 # The warning is torch's own: it comes when its rules for forward mode are loaded.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
@@ -160,19 +93,3 @@ def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
     (unet(leaf)[0] * weights).sum().backward()
     assert leaf.grad is not None
     torch.testing.assert_close((forward * weights).sum(), (leaf.grad * direction).sum())
-
-
-@pytest.mark.parametrize("size", [(7, 9), (16, 32)], ids=str)
-def test_the_last_convolution_of_bfloat16_features_has_a_result_in_float32(size: tuple[int, int]) -> None:
-    layer = nn.Conv2d(32, 7, 3, padding=1).bfloat16().float()
-    features = torch.rand(1, 32, *size).bfloat16().contiguous(memory_format=torch.channels_last)
-    exact = layer.double()(features.double()).detach()
-    layer.float()
-    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        found = convolved_in_float32(features, layer)
-    assert found.dtype == torch.float32
-    # The result has an error of 2^-9, of which the same part remains; sums of 288 products in float32 have far less.
-    torch.testing.assert_close(found.double(), exact, rtol=0, atol=2.0**-17 * float(exact.abs().max()))
-    with torch.autocast("cpu", torch.bfloat16):
-        (gradient,) = torch.autograd.grad(convolved_in_float32(features, layer).sum(), layer.weight)
-    assert gradient.dtype == torch.float32

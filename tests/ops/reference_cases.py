@@ -1,7 +1,5 @@
 """The ops with a fast backend, inputs for them, and layouts of these in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

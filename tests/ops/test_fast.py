@@ -1,17 +1,9 @@
 """The fast backends against plain torch."""
 
-from __future__ import annotations
-
 import contextvars
 import importlib
-import math
-import os
-import shutil
-import subprocess
-import sys
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -34,25 +26,16 @@ from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
 from mcdenoise.ops._numba import _runtime
 
+pytestmark = pytest.mark.usefixtures("nan_in_fresh_memory")
 Draw = Callable[[int], Tensor]
 every_op = pytest.mark.parametrize("op", FAST, ids=lambda op: op.name)
 
 
-@pytest.fixture(autouse=True)
-def nan_in_fresh_memory() -> Iterator[None]:
-    """Fills what is left to be written with NaN, so that what was forgotten shows."""
-    torch.use_deterministic_algorithms(True)
-    yield
-    torch.use_deterministic_algorithms(False)
-
-
 @every_op
 def test_result_is_that_of_plain_torch(op: Op) -> None:
-    for case in op.cases:
-        # The extreme ones have bounds of their own, see `mcdenoise stability`.
-        if case.kind == "extreme":
-            continue
-        for dtype, tolerance in TOLERANCE.items():
+    # The extreme ones have bounds of their own, see `mcdenoise stability`.
+    for i, case in enumerate(case for case in op.cases if case.kind != "extreme"):
+        for dtype, tolerance in [*TOLERANCE.items()][i % 2 :: 2]:
             inputs = case.inputs(dtype)
             actual, plain = (outcomes(op, case, inputs, backend) for backend in ("numba", "torch"))
             assert [tensor.dtype for tensor in actual] == [tensor.dtype for tensor in plain]
@@ -145,12 +128,8 @@ def test_neither_threads_nor_layout_in_memory_change_a_bit(op: Op, monkeypatch: 
             laid_out = map_tensors(lambda x, lay=layout: (lay if x.ndim == 4 else _cells_apart)(x), case.inputs(dtype))
             assert all(map(torch.equal, outcomes(op, case, laid_out, "numba"), expected)), layout.__name__
     monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(5)
-        assert all(map(torch.equal, outcomes(op, case, case.inputs(torch.bfloat16), "numba"), expected))
-    finally:
-        torch.set_num_threads(threads)
+    torch.set_num_threads(5)
+    assert all(map(torch.equal, outcomes(op, case, case.inputs(torch.bfloat16), "numba"), expected))
 
 
 @every_window
@@ -196,18 +175,6 @@ def test_the_default_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     assert chosen(LARGE) == "torch"
 
 
-def test_another_backend_may_be_used_for_a_while() -> None:
-    with ops.use("torch"):
-        assert chosen(LARGE) == "torch"
-        with pytest.raises(ValueError, match="backend:"), ops.use("c"):  # type: ignore[arg-type]
-            pytest.fail("entered")
-        with ops.use("numba", strict=False):
-            assert chosen(SMALL) == "numba"
-            assert chosen(SMALL.to("meta")) == "torch"
-        assert chosen(LARGE) == "torch"
-    assert chosen(LARGE) == "numba"
-
-
 def test_threads_and_contexts_that_use_different_backends_do_not_cross() -> None:
     turns, found = threading.Barrier(2, timeout=60), {}
 
@@ -229,17 +196,6 @@ def test_threads_and_contexts_that_use_different_backends_do_not_cross() -> None
         assert other.run(chosen, LARGE) == "torch"
     assert other.run(chosen, LARGE) == "torch"
     assert chosen(LARGE) == "numba"
-
-
-def test_the_size_of_one_image_can_choose_the_backend_of_all() -> None:
-    with _backend.one_backend(LARGE):
-        assert chosen(SMALL) == "numba"
-        with _backend.one_backend(SMALL):
-            assert chosen(LARGE) == "numba"
-    with _backend.one_backend(SMALL):
-        assert chosen(LARGE) == "torch"
-    with ops.use("torch"), _backend.one_backend(LARGE):
-        assert chosen(LARGE) == "torch"
 
 
 def test_a_named_backend_runs_or_says_why_it_cannot(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,76 +250,9 @@ def test_histories_of_any_layout_and_by_any_number_of_threads(
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
     plain = by("torch", op.function)(**inputs, **limits)
-    threads = torch.get_num_threads()
-    try:
-        for layout in (channels_last, slice_of_pixels, every_other_column, transposed):
-            for count in (1, 3):
-                torch.set_num_threads(count)
-                results = by("numba", op.function)(**map_tensors(layout, inputs), **limits)
-                for result, expected in zip(results, plain, strict=True):
-                    torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)
-    finally:
-        torch.set_num_threads(threads)
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_what_no_tap_shows_is_zero_whatever_the_image_holds(value: float) -> None:
-    """The normals of both frames face away from one another, so that no tap is kept."""
-    image = torch.full((1, 2, 4, 6), value)
-    normal = torch.ones(1, 3, 4, 6) / math.sqrt(3)
-    found, weight = by("numba", ops.reproject)(
-        image, torch.full((1, 2, 4, 6), 0.25), ops.Surface(None, normal, None), ops.Surface(None, -normal, None)
-    )
-    assert not found.any()
-    assert not weight.any()
-
-
-@pytest.mark.parametrize(("settings", "message"), [({"rule": "svgf"}, "rule: expected"), ({"rule": "bmfr"}, "needs")])
-def test_accumulation_refuses_the_same_arguments_as_plain_torch(settings: dict[str, Any], message: str) -> None:
-    inputs = ACCUMULATE.cases[1].inputs()
-    for backend in ("torch", "numba"):
-        with pytest.raises(ValueError, match=message):
-            by(backend, ops.accumulate)(**inputs, **settings)
-
-
-@pytest.mark.slow
-def test_without_a_folder_for_compiled_code_it_is_compiled_anew() -> None:
-    code = (
-        "import numba.core.caching as caching, torch\n"
-        "for name in dir(caching):\n"
-        "    kind = getattr(caching, name)\n"
-        "    if hasattr(kind, '_locator_classes'):\n"
-        "        kind._locator_classes = []\n"
-        "from mcdenoise.ops import kernel_conv\n"
-        "from mcdenoise.ops._op import plain\n"
-        "image, kernel = torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96)\n"
-        "found, expected = (by(image, kernel) for by in (kernel_conv, plain(kernel_conv)))\n"
-        "torch.testing.assert_close(found, expected)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_a_change_in_any_file_that_a_kernel_has_built_in_compiles_it_again(tmp_path: Path) -> None:
-    """Numba itself looks at the file of the kernel alone."""
-    shutil.copytree(Path(ops.__file__).parent, tmp_path / "mcdenoise" / "ops", ignore=shutil.ignore_patterns("__py*"))
-    (tmp_path / "mcdenoise" / "__init__.py").touch()
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    code = (
-        "import torch\n"
-        "from mcdenoise.ops._numba.transfer import compress\n"
-        "print(compress(torch.ones(1, 1, 1, 1, dtype=torch.float64)).item())\n"
-    )
-
-    def run() -> float:
-        command = [sys.executable, "-c", code]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        return float(done.stdout)
-
-    runtime = tmp_path / "mcdenoise" / "ops" / "_numba" / "_runtime.py"
-    before = run()
-    assert run() == before
-    runtime.write_text(runtime.read_text().replace("return math.log(value)", "return 2 * math.log(value)"))
-    assert run() != pytest.approx(before)
+    for layout in (channels_last, slice_of_pixels, every_other_column, transposed):
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            results = by("numba", op.function)(**map_tensors(layout, inputs), **limits)
+            for result, expected in zip(results, plain, strict=True):
+                torch.testing.assert_close(result, expected, rtol=1e-12, atol=1e-12)

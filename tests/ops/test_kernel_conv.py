@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -13,88 +11,10 @@ from mcdenoise.ops import kernel_conv, kernel_splat
 
 BORDERS = ["replicate", "zeros", "renormalize"]
 every_border = pytest.mark.parametrize("border", BORDERS)
-# Height, width, kernel size: odd, even, smaller than the kernel, a row, a pixel.
-SIZES = [(5, 7, 3), (4, 6, 5), (3, 2, 7), (1, 9, 3), (1, 1, 5), (6, 5, 1)]
-every_size = pytest.mark.parametrize(("height", "width", "size"), SIZES)
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def draw_weights(height: int, width: int, size: int, batch: int = 2) -> Tensor:
-    return draw(batch, size * size, height, width, seed=1).abs() + 0.1
-
-
-def flip(kernel: Tensor, dims: tuple[int, ...]) -> Tensor:
-    """A kernel image flipped in rows (1) or columns (2), of its taps as of its pixels."""
-    size = round(kernel.shape[1] ** 0.5)
-    return kernel.unflatten(1, (size, size)).flip([*dims, *(dim + 2 for dim in dims)]).flatten(1, 2)
-
-
-@every_border
-@every_size
-def test_splat_is_the_transpose_of_gather(border: Any, height: int, width: int, size: int) -> None:
-    x, y = draw(2, 3, height, width), draw(2, 3, height, width, seed=2)
-    kernel = draw_weights(height, width, size)
-    gathered = (kernel_conv(x, kernel, border=border) * y).sum()
-    splatted = (x * kernel_splat(y, kernel, border=border)).sum()
-    torch.testing.assert_close(gathered, splatted, rtol=1e-12, atol=1e-12)
-
-
-@every_border
-@every_size
-def test_splat_is_what_autograd_says_of_gather(border: Any, height: int, width: int, size: int) -> None:
-    x, y = draw(2, 3, height, width).requires_grad_(), draw(2, 3, height, width, seed=2)
-    kernel = draw_weights(height, width, size)
-    (gradient,) = torch.autograd.grad(kernel_conv(x, kernel, border=border), x, y)
-    torch.testing.assert_close(gradient, kernel_splat(y, kernel, border=border), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("border", ["replicate", "renormalize"])
-@every_size
-def test_a_constant_image_stays_as_it_is(border: Any, height: int, width: int, size: int) -> None:
-    weights = draw_weights(height, width, size)
-    weights = weights / weights.sum(1, keepdim=True)
-    constant = torch.tensor([0.25, 3.0, 1e4], dtype=torch.float64)[:, None, None].expand(2, 3, height, width)
-    torch.testing.assert_close(kernel_conv(constant, weights, border=border), constant, rtol=1e-12, atol=0)
-
-
-def test_renormalize_makes_any_weights_a_mean() -> None:
-    weights = 7 * draw_weights(5, 7, 5)
-    constant = torch.full((2, 1, 5, 7), 3.0, dtype=torch.float64)
-    torch.testing.assert_close(kernel_conv(constant, weights, border="renormalize"), constant, rtol=1e-12, atol=0)
-
-
-def test_zeros_darken_the_border() -> None:
-    box = torch.full((1, 9, 3, 3), 1 / 9)
-    expected = torch.tensor([[4.0, 6.0, 4.0], [6.0, 9.0, 6.0], [4.0, 6.0, 4.0]])
-    torch.testing.assert_close(kernel_conv(torch.full((1, 1, 3, 3), 9.0), box, border="zeros")[0, 0], expected)
-
-
-@pytest.mark.parametrize("border", ["replicate", "renormalize"])
-def test_splatting_with_weights_of_sum_one_keeps_the_energy(border: Any) -> None:
-    image, weights = draw(2, 3, 5, 7), draw_weights(5, 7, 5)
-    weights = weights / weights.sum(1, keepdim=True)
-    total = kernel_splat(image, weights, border=border).sum((2, 3))
-    torch.testing.assert_close(total, image.sum((2, 3)), rtol=1e-12, atol=1e-12)
-
-
-@every_border
-def test_no_weights_no_light(border: Any) -> None:
-    image, weights = draw(1, 3, 4, 5), torch.zeros(1, 9, 4, 5, dtype=torch.float64)
-    for op in (kernel_conv, kernel_splat):
-        assert torch.equal(op(image, weights, border=border), torch.zeros_like(image))
-
-
-@every_border
-@pytest.mark.parametrize("dims", [(2,), (1,), (1, 2)])
-@pytest.mark.parametrize("op", [kernel_conv, kernel_splat])
-def test_flips_commute(op: Callable[..., Tensor], dims: tuple[int, ...], border: Any) -> None:
-    image, kernel = draw(2, 3, 5, 6), draw_weights(5, 6, 3)
-    pixels = [1 + dim for dim in dims]
-    flipped = op(image.flip(pixels), flip(kernel, dims), border=border)
-    torch.testing.assert_close(flipped, op(image, kernel, border=border).flip(pixels), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("border", "kornia_border"), [("replicate", "replicate"), ("zeros", "constant")])
@@ -133,15 +53,6 @@ class _Largest(TorchDispatchMode):
         if isinstance(result, Tensor) and result.untyped_storage().data_ptr() not in self._given:
             self.numel = max(self.numel, result.untyped_storage().nbytes() // result.element_size())
         return result
-
-
-@pytest.mark.parametrize("op", [kernel_conv, kernel_splat])
-@pytest.mark.parametrize("border", ["replicate", "zeros"])
-def test_memory_is_that_of_a_padded_image(op: Callable[..., Tensor], border: Any) -> None:
-    image, kernel = torch.rand(1, 3, 32, 32), torch.rand(1, 49, 32, 32)
-    with _Largest([image, kernel]) as largest:
-        op(image, kernel, border=border)
-    assert largest.numel <= 3 * (32 + 6) ** 2
 
 
 @pytest.mark.parametrize("op", [kernel_conv, kernel_splat])

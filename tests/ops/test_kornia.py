@@ -1,7 +1,5 @@
 """Where an operator and a primitive of kornia compute the same thing, they agree; docs/kornia.md lists the pairs."""
 
-from __future__ import annotations
-
 import kornia
 import torch
 from torch import Tensor

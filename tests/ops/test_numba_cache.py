@@ -1,10 +1,6 @@
 """Compiled code that is kept from run to run: nothing foreign is used, and no run ends because of it."""
 
-from __future__ import annotations
-
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,29 +68,3 @@ def test_a_folder_that_everybody_may_write_is_not_used(twice: Callable[..., Any]
     path.write_bytes(f"cposix\nmkdir\n(V{tmp_path / 'opened'}\ntR.".encode())
     assert [hits(twice, 2.0) for _ in range(2)] == [0, 0]
     assert not (tmp_path / "opened").exists()
-
-
-def test_two_processes_that_write_at_once_do_not_mix_their_code(twice: Callable[..., Any], folder: Path) -> None:
-    assert hits(twice, 2.0) == 0
-    (index,) = files(folder, ".nbi")
-    (own,) = files(folder, ".nbc")
-    index.unlink()
-    # It knows of no other code, and must not overwrite what another process is entering.
-    assert hits(twice, 2) == 0
-    assert own in files(folder, ".nbc")
-    assert len(files(folder, ".nbc")) == 2
-
-
-@pytest.mark.slow
-def test_an_op_runs_without_room_for_its_code(tmp_path: Path) -> None:
-    # Every write beyond 4 KB fails, as on a full disk.
-    code = (
-        "import resource, signal; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "import torch; from mcdenoise import ops\n"
-        "with ops.use('numba'): print(ops.downsample(torch.ones(1, 1, 2, 2)).item())\n"
-    )
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert (done.returncode, done.stderr, done.stdout.strip()) == (0, "", "1.0")

@@ -1,7 +1,5 @@
 """Bicubic resampling: known answers, torch's own, and what it does to a history."""
 
-from __future__ import annotations
-
 import cmath
 import math
 
@@ -9,7 +7,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.testing import assert_close
 
 from mcdenoise import ops
 from mcdenoise.ops import reproject, resample
@@ -60,55 +57,6 @@ def nearest(previous: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     ]
     taps = torch.stack([previous.flatten(2).gather(2, at.flatten(2)).reshape(previous.shape) for at in places])
     return taps.amin(0), taps.amax(0)
-
-
-def test_runs_of_pixels_that_move_alike_have_the_reference_result() -> None:
-    # A zoom that shows more than the image, and pixels without a place.
-    previous = draw(1, 2, 30, 40)
-    rows, columns = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
-    motion = torch.stack([0.3 * (columns - 18), 0.2 * (rows - 13)])[None].double()
-    motion[:, 0, ::7, ::5] = torch.inf
-    with ops.use("torch"):
-        expected = resample(previous, motion)
-    with ops.use("numba"):
-        assert_close(resample(previous, motion), expected, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_whole_pixels_are_exact_and_the_edge_is_repeated(backend: str) -> None:
-    previous = draw(1, 3, 6, 7)
-    with ops.use(backend):
-        assert torch.equal(resample(previous, shift(0, 0, 6, 7)), previous)
-        moved = resample(previous, shift(2, -1, 6, 7))
-        assert torch.equal(moved[..., 1:, :5], previous[..., :5, 2:])
-        assert torch.equal(moved[..., 0, :5], previous[..., 0, 2:])
-        assert torch.equal(moved[..., 1:, 5:], previous[..., :5, 6:].expand(1, 3, 5, 2))
-        far = resample(previous, shift(1e9, 0, 6, 7))
-    assert torch.equal(far, previous[..., 6:].expand_as(previous))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_unknown_motion_gives_zero(backend: str) -> None:
-    motion = torch.zeros(1, 2, 2, 3, dtype=torch.float64)
-    motion[0, 0, 0, 0], motion[0, 1, 0, 1], motion[0, 0, 1, 2] = torch.inf, torch.nan, -torch.inf
-    with ops.use(backend):
-        value = resample(torch.ones(1, 1, 2, 3, dtype=torch.float64), motion)
-    assert value.flatten().tolist() == [0, 0, 1, 1, 1, 0]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16])
-def test_both_backends_agree_in_every_dtype_and_layout(dtype: torch.dtype) -> None:
-    previous, motion = draw(2, 5, 9, 11).to(dtype), (6 * (draw(2, 2, 9, 11, seed=2) - 0.5)).float()
-    with ops.use("torch"):
-        expected = resample(previous, motion)
-    with ops.use("numba"):
-        found = resample(previous, motion)
-        strided = resample(previous.contiguous(memory_format=torch.channels_last), motion.mT.contiguous().mT)
-    assert found.dtype == dtype
-    # Sums of 16 products, in two orders, of values of at most 1 and weights that add up to at most 2; then both round.
-    sums, rounded = 16 * 2 * torch.finfo(torch.float32).eps, torch.finfo(dtype).eps
-    assert_close(found, expected, rtol=0 if dtype == torch.float32 else rounded, atol=sums)
-    assert torch.equal(found, strided)
 
 
 def test_a_history_stays_sharper_than_by_bilinear_interpolation() -> None:

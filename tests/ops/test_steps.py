@@ -1,7 +1,5 @@
 """Properties of every fused step: its formula, its derivatives, and its stability."""
 
-from __future__ import annotations
-
 import inspect
 
 import pytest

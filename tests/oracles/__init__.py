@@ -4,8 +4,6 @@ These functions are slow, and written to be compared with the formulas by eye. T
 both cannot have the same error. They take the arguments of the ops; their results are always float64.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

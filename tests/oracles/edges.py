@@ -1,7 +1,5 @@
 """Windows that stop at edges, and tests of brightness."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

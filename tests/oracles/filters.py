@@ -1,7 +1,5 @@
 """The filters of one image with weights of each pixel."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

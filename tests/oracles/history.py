@@ -1,7 +1,5 @@
 """From frame to frame."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Images as nested lists of numbers, and the taps of a window."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Sequence

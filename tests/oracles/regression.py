@@ -1,7 +1,5 @@
 """Regression in decimal numbers."""
 
-from __future__ import annotations
-
 import itertools
 from decimal import Decimal, localcontext
 

@@ -1,7 +1,5 @@
 """Resolutions, albedo, and the bilateral grid."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

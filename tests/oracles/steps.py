@@ -1,7 +1,5 @@
 """The formulas of the fused steps in float64, written with torch's primitives or with other oracles."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -1,7 +1,5 @@
 """A finished benchmark of two scenes: real errors of made-up pictures, and every way to have no figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

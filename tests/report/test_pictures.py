@@ -1,29 +1,7 @@
-from __future__ import annotations
-
-import base64
-import io
-
 import numpy as np
-import PIL.Image
 import pytest
 
-from mcdenoise.report.pictures import (
-    BRIGHTEST,
-    FORMATS,
-    choose_crops,
-    choose_row,
-    crop_errors,
-    data_uri,
-    data_uris,
-    decode,
-    encode,
-    halved,
-    to_srgb,
-)
-
-
-def opened(uri: str) -> np.ndarray:
-    return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))))
+from mcdenoise.report.pictures import BRIGHTEST, FORMATS, choose_crops, choose_row, data_uri, data_uris, decode, encode
 
 
 def test_a_code_is_the_nearest_one():
@@ -35,22 +13,11 @@ def test_a_code_is_the_nearest_one():
     assert (decode(codes[below] + 0.5) >= radiance[below] * (1 - 1e-5)).all()
 
 
-def test_error_where_pictures_mostly_are():
-    radiance = np.geomspace(0.1, 2.0, 2000).astype(np.float32)
-    error = np.abs(decode(encode(radiance)) / radiance - 1)
-    assert error.max() < 0.018
-
-
 def test_codes_of_known_values():
     # Computed by hand: x = 1 is 1/2 of 64/65, and (65/128)^(1/2.2) = 0.7350, times 255 = 187.4.
     assert encode(np.float32([0, 1, BRIGHTEST, 1e9, np.inf, np.nan, -3])).tolist() == [0, 187, 255, 255, 255, 0, 0]
     assert decode(np.array([0, 255])) == pytest.approx([0, BRIGHTEST])
     assert (encode(decode(np.arange(256)).astype(np.float32)) == np.arange(256)).all()
-
-
-def test_the_first_format_loses_nothing():
-    codes = np.random.default_rng(0).integers(0, 256, (13, 17, 3), dtype=np.uint8)
-    assert (opened(data_uri(codes)) == codes).all()
 
 
 def test_coarser_formats_when_the_budget_is_small():
@@ -62,18 +29,6 @@ def test_coarser_formats_when_the_budget_is_small():
     assert name == "JPEG of quality 95"
     assert sum(map(len, files)) <= sizes[1]
     assert data_uris(codes, sizes[-1] - 1) is None
-
-
-def test_halved_is_the_mean_of_four():
-    image = np.arange(5 * 4 * 3, dtype=np.float32).reshape(5, 4, 3)
-    small = halved(image)
-    assert small.shape == (2, 2, 3)
-    assert small[0, 1, 2] == np.mean([image[0, 2, 2], image[0, 3, 2], image[1, 2, 2], image[1, 3, 2]])
-
-
-def test_srgb_of_known_values():
-    shown = to_srgb(np.float32([[[0, 0.0031308, 0.5], [1, 7, 0.2140411]]]))
-    assert shown.tolist() == [[[0, 10, 188], [255, 255, 127]]]
 
 
 def test_crops_are_where_images_differ_and_where_detail_is():
@@ -98,13 +53,6 @@ def test_crops_are_where_images_differ_and_where_detail_is():
 def test_a_frame_too_small_for_three_crops_has_fewer():
     crops = choose_crops([], np.random.default_rng(0).random((9, 20, 3), np.float32))
     assert [(crop.left, crop.top, crop.width, crop.height) for crop in crops] == [(0, 0, 20, 9)]
-
-
-def test_errors_of_a_crop():
-    # Linear 0.2140411 is shown as 0.5, 1 as 1: a difference of 0.5 is 6.02 dB. SMAPE: 0.786 / (1.214 + 0.01).
-    psnr, smape = crop_errors(np.full((4, 5, 3), 0.2140411, np.float32), np.ones((4, 5, 3), np.float32))
-    assert psnr == pytest.approx(6.0206, abs=1e-3)
-    assert smape == pytest.approx((1 - 0.2140411) / (1.2140411 + 0.01), abs=1e-5)
 
 
 def test_row_of_the_profile_is_where_something_flickers():

@@ -1,12 +1,8 @@
-from __future__ import annotations
-
-import dataclasses
 from pathlib import Path
 
 import pytest
 
-from mcdenoise.errors import InputError
-from mcdenoise.report.views import Range, metrics, pareto_front, points, shortlist, views
+from mcdenoise.report.views import Range, pareto_front, shortlist, views
 from mcdenoise.results import Cell, Method, Results, Spread
 
 
@@ -14,15 +10,6 @@ def test_front_of_known_points():
     #         dominated by 1    front       front       dominated    tie in cost, worse   costly and worst
     values = [(2.0, 9.0), (1.0, 8.0), (4.0, 3.0), (5.0, 3.0), (4.0, 4.0), (9.0, 8.5)]
     assert pareto_front(values) == [1, 2]
-
-
-def test_front_of_a_similarity():
-    assert pareto_front([(1.0, 20.0), (2.0, 25.0), (3.0, 24.0), (4.0, 30.0)], higher_is_better=True) == [0, 1, 3]
-
-
-def test_front_of_equal_points_is_the_first():
-    assert pareto_front([(1.0, 1.0), (1.0, 1.0)]) == [0]
-    assert pareto_front([]) == []
 
 
 def test_every_method_off_the_front_is_beaten_by_one_on_it():
@@ -56,32 +43,6 @@ def test_a_method_that_failed_once_has_no_mean_but_a_reason(folder: Path):
     assert not first.rows[3].reason
     assert second.rows[3].reason == "failed: RuntimeError: out of <memory>"
     assert {view.rows[4].reason for view in (mean, first, second)} == {"missing: the package <absent> is not installed"}
-
-
-def test_a_method_that_was_not_measured_says_so(folder: Path):
-    results = Results.read(folder)
-    results.cells.remove(next(cell for cell in results.cells if cell.method == "ours"))
-    assert views(results)[1].rows[1].reason == "not measured"
-
-
-def test_one_scene_has_no_mean(folder: Path):
-    results = Results.read(folder)
-    one = dataclasses.replace(results, scenes=results.scenes[:1])
-    assert [view.name for view in views(one)] == ["first"]
-
-
-def test_points_are_those_with_time_and_error(folder: Path):
-    shown = points(views(Results.read(folder))[1], "SMAPE")
-    # Doing nothing takes no time, which has no place on a logarithmic axis.
-    assert [point.row.number for point in shown] == [2, 3, 4]
-
-
-def test_order_of_metrics_and_unknown_ones(folder: Path):
-    results = Results.read(folder)
-    assert metrics(results) == ["SMAPE", "PSNR"]
-    results.cells.append(Cell("first", "ours", {"beauty": 1.0}, {"beauty": Spread.of([1.0])}))
-    with pytest.raises(InputError, match="found beauty"):
-        metrics(results)
 
 
 def test_a_page_has_the_best_setting_of_each_model_and_the_front(folder: Path):

@@ -1,85 +1,39 @@
 """The suite: its rows, its rendering at tiny sizes, and its tables. Tests that need a renderer are skipped without."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 
-from mcdenoise.cli import main
 from mcdenoise.data import read_exr, write_exr
 from mcdenoise.data.png import read_png
 from mcdenoise.errors import InputError
-from mcdenoise.methods import split_methods
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
-from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
 from mcdenoise.suite import (
-    SHOTS,
     Row,
     Shot,
     choose_rows,
     error_against_time,
-    error_lines,
     markdown,
     open_row,
-    picked_lines,
     render_suite,
     rendering,
     rows_there,
-    sample_curves,
     suite_lines,
 )
 from mcdenoise.suite.close_ups import PARTS, write_close_ups
-from mcdenoise.suite.tables import PICKED, PSNR, SMAPE, TEMPORAL, verdict, with_peers
+from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict
 
 BLENDER = os.environ.get("BLENDER_PYTHON")
 TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
 
 
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Run `mcdenoise benchmark`: exit status, output and messages."""
-
-    def call(*arguments: Any) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as stop:
-            main(["benchmark", *map(str, arguments)])
-        return int(stop.value.code or 0), *capsys.readouterr()
-
-    return call
-
-
 # Rows
-
-
-def test_row_names_are_unique_and_each_sequence_is_also_a_still() -> None:
-    rows = choose_rows()
-    assert len({row.name for row in rows}) == len(rows)
-    assert len({shot.name for shot in SHOTS}) == len(SHOTS)
-    sequences = [shot for shot in SHOTS if shot.frames > 1]
-    assert sum(not row.still for row in rows) == len(sequences)
-    assert sum(row.still for row in rows) == len(SHOTS)
-    for row in rows:
-        # The frame that is denoised alone has a reference.
-        assert row.frames is None or int(row.frames) in row.shot.references
-
-
-def test_the_suite_covers_common_renderings() -> None:
-    shots = [shot for shot in SHOTS if not shot.curve]
-    for renderer in ("mitsuba", "cycles"):
-        own = [shot for shot in shots if shot.renderer == renderer]
-        assert {shot.samples for shot in own} >= {1, 4, 16}
-        assert any(shot.filter == "centre" for shot in own)
-        assert any(shot.lens for shot in own)
-        curve = [shot.samples for shot in SHOTS if shot.curve and shot.renderer == renderer]
-        assert curve == [2**power for power in range(11)]
-    assert any(shot.blur for shot in shots)
-    assert {shot.size for shot in shots} == {(320, 180), (640, 360), (1280, 720)}
 
 
 def test_rows_are_chosen_by_patterns() -> None:
@@ -87,29 +41,6 @@ def test_rows_are_chosen_by_patterns() -> None:
     assert names == ["cycles-gallery-4", "cycles-gallery-4-still", "mitsuba-parlour-lens-4"]
     with pytest.raises(InputError, match=r"--rows: .*'gallery'"):
         choose_rows("cycles-*,gallery")
-
-
-def test_scenes_and_named_parts_fit_together() -> None:
-    cycles = Path(rendering.__file__).with_name("blender_scenes.py").read_text()
-    for shot in SHOTS:
-        if shot.renderer == "cycles":
-            assert f"def {shot.scene}(frames: int)" in cycles
-        assert shot.scene in PARTS or shot.scene.startswith("take ")
-    for parts in PARTS.values():
-        for left, top, right, bottom in parts.values():
-            assert 0 <= left < right <= 1
-            assert 0 <= top < bottom <= 1
-
-
-def test_the_parlour_is_the_same_each_time_and_its_pillar_moves() -> None:
-    first, second = parlour_scene(), parlour_scene()
-    assert first.keys() == second.keys()
-    page = [scene["page"]["bsdf"]["bsdf"]["reflectance"]["bitmap"] for scene in (first, second)]
-    np.testing.assert_array_equal(*page)
-    moves = parlour_moves(4)
-    assert set(moves) <= set(first)
-    np.testing.assert_allclose(np.diff(moves["pillar"][:, 0, 3]), 0.07)
-    assert len(parlour_cameras(4)) == 4
 
 
 # Rendering
@@ -151,13 +82,6 @@ def test_rendering_resumes_and_shares_references(tmp_path: Path, two_shots: list
     render_suite(two_shots, tmp_path)
     assert rows_there(rows, tmp_path) == rows
     assert (tmp_path / "tiny-1" / "inputs" / "color1.exr").stat().st_mtime_ns == kept
-
-
-def test_a_picture_with_a_lens_is_another(two_shots: list[Shot]) -> None:
-    first, second = two_shots
-    assert first.picture == second.picture
-    for change in ({"lens": True}, {"filter": "gaussian"}, {"size": (16, 18)}, {"reference_samples": 4}):
-        assert dataclasses.replace(first, **change).picture != first.picture
 
 
 def test_cycles_needs_a_blender(tmp_path: Path) -> None:
@@ -267,57 +191,6 @@ def test_error_against_time_uses_common_rows_and_names_the_faster_method() -> No
     assert error_against_time(results, []) == ([], 0)
 
 
-def test_lines_of_the_picked_model_are_those_of_its_first_method_on_each_row() -> None:
-    results, rows = _results([0.1, 0.2, 0.3], fast=[0.2, 0.15, 0.2], high=[0.3, 0.1, 0.2])
-    # A second precision, and a second model, once with a setting.
-    results.methods.append(Method("ours, bfloat16", "trainable", "ours16", "cascaded_v2", precision="bfloat16"))
-    results.methods.append(Method("set", "trainable", "set", "oidn_tuned", {"restore": False}))
-    results.methods.append(Method("other", "trainable", "other", "oidn_tuned"))
-    for name, error in (("ours, bfloat16", 0.5), ("set", 0.01), ("other", 0.4)):
-        results.cells.extend(Cell(row, name, {SMAPE: error, PSNR: 100 * (1 - error)}) for row in "ab")
-    lines = suite_lines(results, rows)
-    picked = picked_lines(results, lines, {"a": "cascaded_v2", "b": "oidn_tuned"})
-    assert [(line.row, line.model, line.values[SMAPE]) for line in picked] == [("a", PICKED, 0.1), ("b", PICKED, 0.4)]
-    assert verdict(picked)[0] == "SMAPE: ahead of OIDN's best setting in 1 of 2 rows; behind in b"
-    # Without the model on one row, a table of the others would mislead.
-    assert picked_lines(results, lines, {"a": "cascaded_v2", "c": "oidn_tuned"}) == []
-
-
-def test_rows_with_noisy_references_are_named() -> None:
-    results, rows = _results([0.015], fast=[0.018], high=[0.02])
-    assert verdict(suite_lines(results, rows))[-1] == "rows whose reference noise is more than half of the error: a"
-
-
-def test_without_the_peer_there_is_no_comparison() -> None:
-    results, rows = _results([0.1], fast=[0.2], high=[0.3])
-    results = dataclasses.replace(results, methods=results.methods[:2], cells=results.cells[:2])
-    (line,) = suite_lines(results, rows)
-    assert line.best == {}
-    assert verdict([line]) == [
-        "OIDN is not installed, so there is no comparison with it; pip install 'mcdenoise[peers]'"
-    ]
-    assert "| a | 0.1000 |" in markdown([line], [])
-
-
-def test_points_of_a_curve_are_not_rows_of_the_table() -> None:
-    results, rows = _results([0.2, 0.1], fast=[0.3, 0.2], high=[0.4, 0.3])
-    names = {"a": "scene-samples-1", "b": "scene-samples-2"}
-    rows = [
-        Row(dataclasses.replace(row.shot, name=names[row.name], samples=number, curve=True), True)
-        for number, row in enumerate(rows, 1)
-    ]
-    results = dataclasses.replace(
-        results,
-        scenes=[dataclasses.replace(scene, name=names[scene.name]) for scene in results.scenes],
-        cells=[dataclasses.replace(cell, scene=names[cell.scene]) for cell in results.cells],
-    )
-    assert suite_lines(results, rows) == []
-    lines = error_lines(results, rows)
-    curves = {"ours": [(1, 0.2), (2, 0.1)], "input": [(1, 0.5), (2, 0.5)], "OIDN, best": [(1, 0.3), (2, 0.2)]}
-    assert sample_curves(lines) == {"scene-samples": curves}
-    assert "| scene-samples-2 | 0.5000 | 0.1000 | 0.2000 |" in markdown([], lines)
-
-
 def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
     results, rows = _results([0.1], fast=[0.2], high=[0.3])
     truth = np.full((18, 32, 3), 0.25, np.float32)
@@ -338,15 +211,8 @@ def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
 # The command
 
 
-def test_named_settings_of_oidn_replace_the_eleven() -> None:
-    assert len(split_methods(with_peers("oidn_temporal, svgf"))) == 2 + 11
-    named = "svgf,oidn(quality=fast|balanced, auxiliary=noisy)"
-    assert with_peers(named) == named
-    assert with_peers("oidn") == "oidn"
-
-
 def test_the_command_scores_the_existing_rows(
-    small_sequence: Path, tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+    small_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shot = Shot("small", "mitsuba", "parlour", 1, "centre", frames=4)
     absent = Shot("absent", "mitsuba", "parlour", 1, "centre", frames=1)
@@ -354,6 +220,7 @@ def test_the_command_scores_the_existing_rows(
     shutil.copytree(small_sequence, tmp_path / "data" / "small")
     out = tmp_path / "out"
     status, said, message = run(
+        "benchmark",
         *("--suite", "wild", "--data", tmp_path / "data", "--no-render", "-o", out, "--threads", 1),
         *("--models", "cascaded_v2_micro,oidn(quality=fast)", "--json", tmp_path / "suite.json"),
     )
@@ -382,10 +249,10 @@ def test_the_command_scores_the_existing_rows(
     ],
 )
 def test_bad_arguments_are_rejected_in_one_line(
-    tmp_path: Path, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], expected: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    status, _, message = run(*arguments)
+    status, _, message = run("benchmark", *arguments)
     assert status == 2
     assert expected in message
     assert message.count("\n") == 1

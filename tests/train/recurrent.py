@@ -1,7 +1,5 @@
 """A user's own recurrent denoiser, given as a file and a factory: hidden features that are warped by the motion."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

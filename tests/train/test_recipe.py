@@ -1,36 +1,22 @@
 """Recipes: from nothing to weights by one command, also when it is stopped, and recipes that are refused."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from commands import refuses, run, succeeds
 
-from mcdenoise.cli import main
 from mcdenoise.cli.train import options_of
 from mcdenoise.data import open_sequence
-from mcdenoise.errors import InputError
 from mcdenoise.models import describe_weights
-from mcdenoise.train import Recipe, Rendering, clean_references
+from mcdenoise.train import Recipe, clean_references
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 TINY = RECIPES / "tiny.toml"
 WEIGHTS = "cascaded_v2_micro.safetensors"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    """The same weights again, and networks this small are several times slower on several threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -40,15 +26,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
     out = tmp_path_factory.mktemp("recipe") / "run"
-    assert follow(TINY, out) == 0
+    succeeds("train", "--recipe", TINY, "-o", out)
     return out
-
-
-def follow(recipe: Path, out: Path, *arguments: object) -> object:
-    """Exit status of the command that a person gives."""
-    with pytest.raises(SystemExit) as stop:
-        main(["train", "--recipe", str(recipe), "-o", str(out), *map(str, arguments)])
-    return stop.value.code
 
 
 def changed(tmp_path: Path, old: str, new: str) -> Path:
@@ -60,19 +39,11 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
     return path
 
 
-def test_data_may_have_a_folder_of_a_name(tmp_path: Path) -> None:
-    named = Recipe.read(changed(tmp_path, "frames = 3", "frames = 3\nfolder = 'mine'"), options_of("generate")).data[0]
-    other = Recipe.read(TINY, options_of("generate")).data[0]
-    assert named.folder(tmp_path) == tmp_path / "mine"
-    # Where they are does not change what they are.
-    assert named.sha256 == other.sha256
-
-
 def renderings(data: Path) -> dict[Path, int]:
     return {path.relative_to(data): path.stat().st_mtime_ns for path in data.rglob("*.exr")}
 
 
-def test_from_nothing_to_weights(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_from_nothing_to_weights(trained: Path) -> None:
     folders = [json.loads(path.read_text())["seeds"] for path in (trained / "data").glob("*/finished.json")]
     assert sorted(folders) == ["0-1", "2"]
     said = json.loads((trained / "data.json").read_text())
@@ -82,9 +53,9 @@ def test_from_nothing_to_weights(trained: Path, capsys: pytest.CaptureFixture[st
     assert describe_weights(trained / WEIGHTS)["recipe"] == said["recipe"]
 
     before = renderings(trained / "data"), (trained / WEIGHTS).stat().st_mtime_ns
-    assert follow(TINY, trained) == 0
+    printed = succeeds("train", "--recipe", TINY, "-o", trained)
     assert (renderings(trained / "data"), (trained / WEIGHTS).stat().st_mtime_ns) == before
-    errors, expected, weights = capsys.readouterr().out.splitlines()
+    errors, expected, weights = printed.splitlines()
     scores = json.loads((trained / "log.jsonl").read_text().splitlines()[-1])["validation"]
     assert errors.startswith(f"validation  smape {scores['smape']:.4f}  psnr {scores['psnr']:.4f}")
     assert expected == f"expected a smape of at most 0.139 + 0.01, found {scores['smape']:.4f}: met"
@@ -92,35 +63,35 @@ def test_from_nothing_to_weights(trained: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_a_run_that_was_killed_while_it_rendered_goes_on(trained: Path, tmp_path: Path) -> None:
-    run, data = tmp_path / "run", tmp_path / "data"
+    out, data = tmp_path / "run", tmp_path / "data"
     shutil.copytree(trained / "data", data)
     (frame,) = data.glob("*/random0000/inputs/color2.exr")
     (frame.parents[2] / "finished.json").unlink()
     frame.unlink()
     before = renderings(data)
-    assert follow(TINY, run, "--data", data) == 0
+    succeeds("train", "--recipe", TINY, "-o", out, "--data", data)
     after = renderings(data)
     assert after.keys() - before.keys() == {frame.relative_to(data)}
     assert {path: after[path] for path in before} == before
-    assert (run / "data.json").read_bytes() == (trained / "data.json").read_bytes()
-    assert describe_weights(run / WEIGHTS)["sha256"] == describe_weights(trained / WEIGHTS)["sha256"]
+    assert (out / "data.json").read_bytes() == (trained / "data.json").read_bytes()
+    assert describe_weights(out / WEIGHTS)["sha256"] == describe_weights(trained / WEIGHTS)["sha256"]
 
 
-def test_another_recipe_does_not_go_on_with_a_run(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_recipe_does_not_go_on_with_a_run(trained: Path, tmp_path: Path) -> None:
     before = renderings(trained / "data")
     recipe = changed(tmp_path, "steps = 12", "steps = 13")
-    assert follow(recipe, trained) == 2
-    assert "config.json: expected steps=13 as in this run, found steps=12" in capsys.readouterr().err
+    status, _, said = run("train", "--recipe", recipe, "-o", trained)
+    assert status == 2
+    assert "config.json: expected steps=13 as in this run, found steps=12" in said
     # Other data for the same training, as if they were rendered already.
     recipe, data = changed(tmp_path, 'seeds = "0-1"', 'seeds = "1"'), tmp_path / "data"
     shutil.copytree(trained / "data", data)
     both, one = (Recipe.read(path, options_of("generate")).data[0].folder(data) for path in (TINY, recipe))
     shutil.rmtree(both / "random0000")
     both.rename(one)
-    assert follow(recipe, trained, "--data", data) == 2
-    assert "data.json: expected " in capsys.readouterr().err
+    status, _, said = run("train", "--recipe", recipe, "-o", trained, "--data", data)
+    assert status == 2
+    assert "data.json: expected " in said
     assert renderings(trained / "data") == before
 
 
@@ -155,11 +126,7 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ("steps = 12", "steps = 0", "steps: expected at least 1, found 0"),
         ('"cascaded_v2_micro"', '"cascade"', "cascade"),
         ("[[data]]", "[data]", "expected tables [[data]], found [data]"),
-        (
-            '[[data]]\nseeds = "0-1"',
-            '[[data]]\nseed = "0-1"',
-            "[[data]] 1: unknown key 'seed'; known are ",
-        ),
+        ('[[data]]\nseeds = "0-1"', '[[data]]\nseed = "0-1"', "[[data]] 1: unknown key 'seed'; known are "),
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),
         ("frames = 3", "frames = 0", "[[data]] 1: --frames: expected at least 1, found 0"),
         ("frames = 3", "folder = '../elsewhere'", "[[data]] 1: folder: expected letters, digits, "),
@@ -179,18 +146,16 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ("[expected]", "[[run]]\nname = 'a'\nsteps = 0\n[run.expected]", "[[run]] 1: steps: expected at least 1"),
     ],
 )
-def test_bad_recipes(tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str) -> None:
+def test_bad_recipes(tmp_path: Path, old: str, new: str, message: str) -> None:
     recipe = changed(tmp_path, old, new)
     # Whatever is wrong, nothing is rendered first.
-    assert follow(recipe, tmp_path / "run", "--data", tmp_path / "data") == 2
-    said = capsys.readouterr().err
+    said = refuses("train", "--recipe", recipe, "-o", tmp_path / "run", "--data", tmp_path / "data")
     assert said.startswith(f"mcdenoise train: {recipe}: ")
     assert message in said
-    assert said.count("\n") == 1
     assert not list(tmp_path.rglob("*.exr"))
 
 
-def test_runs_on_the_same_data(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_runs_on_the_same_data(trained: Path, tmp_path: Path, out: Path) -> None:
     before = renderings(trained / "data")
     bound = "{ smape = 0.2, tolerance = 0.1 }"
     runs = f"""
@@ -214,65 +179,28 @@ steps = 2
 """
     recipe = tmp_path / "runs.toml"
     recipe.write_text(TINY.read_text().partition("[expected]")[0] + runs)
-    out = tmp_path / "out"
-    assert follow(recipe, out, "--data", trained / "data", "--runs", "K-5", "other-loss") == 0
+    command = ["train", "--recipe", recipe, "-o", out, "--data", trained / "data", "--runs"]
+    said = succeeds(*command, "K-5", "other-loss")
     assert sorted(path.name for path in out.iterdir()) == ["K-5", "cache", "other-loss"]
     assert renderings(trained / "data") == before
     config = json.loads((out / "other-loss" / "config.json").read_text())
     assert (config["loss"], config["steps"], config["width"]) == ("l1_display", 2, 8)
     about = describe_weights(out / "K-5" / "cascaded.safetensors")
     assert (about["settings"]["cascade"], json.loads((out / "K-5" / "config.json").read_text())["seed"]) == ("K", 5)
-    said = capsys.readouterr().out
     # The expected error is printed for the run that has one.
     assert said.count("expected a smape of at most") == said.count("0.2 + 0.1") == 1
     # A run has the common settings where it states none: this one is the recipe of a single run.
     # Data that another run has rendered are used, and the expected error of weights does not change them.
-    assert follow(recipe, out, "--data", trained / "data", "--runs", "as-it-was") == 0
-    both = [describe_weights(run / WEIGHTS) for run in (trained, out / "as-it-was")]
+    status, _, said = run(*command, "as-it-was")
+    assert status == 0
+    both = [describe_weights(each / WEIGHTS) for each in (trained, out / "as-it-was")]
     assert len({about["sha256"] for about in both}) == len({about["recipe"] for about in both}) == 1
-    said = capsys.readouterr().err
     assert said.splitlines()[-1].startswith("warning: expected a smape of at most 0 + 1e-09, found 0.")
     assert said.endswith(": missed\n")
-    assert follow(recipe, out, "--runs", "P") == 2
     expected = "--runs: expected names of the recipe's runs (as-it-was, K-4, K-5, other-loss), found 'P'"
-    assert expected in capsys.readouterr().err
-    assert follow(TINY, tmp_path / "run", "--runs", "K") == 2
-    assert "(a single run without a name), found 'K'" in capsys.readouterr().err
-
-
-def test_a_recipe_without_data(tmp_path: Path) -> None:
-    path = tmp_path / "empty.toml"
-    with pytest.raises(InputError, match=r"empty\.toml:"):
-        Recipe.read(path, options_of("generate"))
-    path.write_text("")
-    with pytest.raises(InputError, match=r"empty\.toml:"):
-        Recipe.read(path, options_of("generate"))
-
-
-@pytest.mark.parametrize(
-    "others", [["somewhere"], ["--steps", "3"], ["--validation", "somewhere"], ["--initial-weights", "file"]]
-)
-def test_nothing_beside_a_recipe_says_what_is_trained(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], others: list[str]
-) -> None:
-    assert follow(TINY, tmp_path / "run", *others) == 2
-    assert "expected none beside --recipe, which says what is trained, found one" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("option", ["--data", "--runs"])
-def test_options_of_recipes_need_a_recipe(capsys: pytest.CaptureFixture[str], option: str) -> None:
-    with pytest.raises(SystemExit):
-        main(["train", "somewhere", "-o", "out", option, "data"])
-    assert f"{option}: expected a --recipe" in capsys.readouterr().err
-
-
-def test_the_same_options_have_the_same_place(tmp_path: Path) -> None:
-    def place(**options: object) -> Path:
-        return Rendering("a recipe", options, clean=False).folder(tmp_path)
-
-    assert place(seeds="1", frames=2) == place(frames=2, seeds="1", workers=2)
-    assert len({place(seeds="1"), place(seeds="2"), place(seeds="1", frames=2)}) == 3
+    assert expected in refuses(*command, "P")
+    command = ["train", "--recipe", TINY, "-o", tmp_path / "run", "--runs", "K"]
+    assert "(a single run without a name), found 'K'" in refuses(*command)
 
 
 @pytest.mark.parametrize("place", [".", "inputs"])
@@ -290,25 +218,3 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
     # Facts about the references as rendered are not stated of the filtered ones.
     said = json.loads((copied / "inputs" / "camera.json").read_text())
     assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux"}
-
-
-def test_cleaned_references_of_a_recipe(small_sequence: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
-    rendering = Rendering("a recipe", {"seeds": "0"}, clean=True)
-
-    def generate() -> None:
-        shutil.copytree(small_sequence, rendering.folder(tmp_path) / "plane")
-
-    (cleaned,) = rendering.make(tmp_path, generate)
-    assert cleaned.parent == tmp_path / f"{rendering.folder(tmp_path).name}-clean"
-    times = renderings(tmp_path)
-    # Neither rendered nor cleaned again.
-    assert rendering.make(tmp_path, generate) == [cleaned]
-    assert renderings(tmp_path) == times
-
-
-def test_clean_references_need_their_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    recipe = changed(tmp_path, "frames = 3", "frames = 3\nclean_references = true")
-    with pytest.raises(InputError, match=r"changed\.toml: .* pip install 'mcdenoise\[oidn\]'"):
-        Recipe.read(recipe, options_of("generate"))

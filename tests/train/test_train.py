@@ -1,56 +1,39 @@
 """Training: clips that keep physics intact, runs that learn, stop and go on, and data that is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
-import io
 import json
 import os
 import platform
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from refusals import full_disk, refused
 from safetensors.torch import load_file
 from torch import Tensor
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
-from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.errors import InputError
-from mcdenoise.metrics import smape_linear
-from mcdenoise.models import DEFAULT, CoarseToFine, Demodulated, Restored, create_model, describe_weights, load_weights
+from mcdenoise.models import DEFAULT, describe_weights, load_weights
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
 
 from mcdenoise.train import Progress, RunFolder, TrainConfig, train
 from mcdenoise.train.clips import Clip, ClipSampler
-from mcdenoise.train.data import DataFolders, TrainingData
-from mcdenoise.train.front import split
 
 SMALL: dict[str, Any] = {"width": 4, "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
 FIELDS = {field.name for field in dataclasses.fields(TrainConfig)}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread() -> Iterator[None]:
-    """Networks this small are several times slower on several threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")
@@ -75,36 +58,13 @@ def again(finished: Path, shared_sequence: Path, tmp_path: Path) -> Callable[...
     return go_on
 
 
-@contextmanager
-def full_disk(size: int) -> Iterator[None]:
-    """The system refuses longer files, as it refuses to write to a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 class Stopped(Exception):
     """The power fails."""
-
-
-def refused(action: Callable[[], object]) -> str:
-    with pytest.raises(InputError) as error:
-        action()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 def create_settings(**changed: Any) -> dict[str, Any]:
     """Every setting that the weights of the default model are of."""
     return {"width": 40, "kernel_width": None, "kernel_size": 5, "resolutions": 3, "half": False, **changed}
-
-
-def data_of(config: TrainConfig, *folders: Path, validation: list[Path] | None = None, cache: Path) -> TrainingData:
-    front, rest = split(create_model(config.model, **config.model_settings))
-    return DataFolders.open(config, front, rest.needs, list(folders), validation or []).load(cache)
 
 
 def state(run: Path) -> list[Tensor]:
@@ -171,17 +131,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(shared_sequence: P
 
 def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
     run, weights = finished, finished / f"{DEFAULT}.safetensors"
-    names = {path.name for path in run.iterdir() if not path.name.startswith("events.")}
-    assert names == {
-        "cache",
-        f"{DEFAULT}.safetensors",
-        "checkpoint.pt",
-        "config.json",
-        "data.json",
-        "log.jsonl",
-    }
-    assert any(path.name.startswith("events.out.tfevents") for path in run.iterdir())
-
+    assert len(list(run.glob("events.out.tfevents*"))) == 1
     config = json.loads((run / "config.json").read_text())
     assert TrainConfig(**config) == TrainConfig(**SMALL)
     digest = hashlib.sha256()
@@ -195,11 +145,7 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
     entry["sha256"] = digest.hexdigest()
     assert data == {"credits": "A. Painter, CC0", "initial_weights": "none", "sequences": [entry]}
     start, *log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    assert start["first_step"] == 0
-    assert set(start) == {"first_step", "commit", "threads", "processes"}
-    assert [entry["step"] for entry in log] == [2, 4, 6]
-    names = {"step", "loss", "gradient_norm", "learning_rate", "seconds", "validation"}
-    assert all(set(entry) == names for entry in log)
+    assert (start["first_step"], [entry["step"] for entry in log]) == (0, [2, 4, 6])
     assert all(entry["gradient_norm"] > 0 and entry["learning_rate"] == 1e-4 for entry in log)
 
     about = describe_weights(weights)
@@ -211,120 +157,6 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
     saved = torch.load(run / "checkpoint.pt", weights_only=True)["parts"][0]
     for key, tensor in load_weights(weights, DEFAULT).state_dict().items():
         assert torch.equal(tensor, saved[key].half().float())
-
-
-def test_bfloat16_learns_float32_weights(shared_sequence: Path, tmp_path: Path) -> None:
-    train(TrainConfig(**{**SMALL, "steps": 2}, precision="bfloat16"), [shared_sequence], tmp_path / "run")
-    saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["parts"][0]
-    assert {tensor.dtype for tensor in saved.values()} == {torch.float32}
-    assert all(torch.isfinite(tensor).all() for tensor in saved.values())
-
-
-def test_a_step_has_as_many_resolutions_as_are_drawn(
-    shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[tuple[bool, int]] = []
-    forward = CoarseToFine.forward
-
-    def spy(self: CoarseToFine, *arguments: Any, **named: Any) -> Any:
-        seen.append((self.training, self.resolutions))
-        return forward(self, *arguments, **named)
-
-    monkeypatch.setattr(CoarseToFine, "forward", spy)
-    settings, cache = {**SMALL, "steps": 12}, tmp_path / "cache"
-    train(TrainConfig(**settings), [shared_sequence], tmp_path / "drawn", cache=cache)
-    drawn = [resolutions for training, resolutions in seen if training]
-    assert set(drawn) == {1, 2, 3}
-    assert {resolutions for training, resolutions in seen if not training} == {3}
-    # The same again: a run goes on as if it had not been stopped.
-    seen.clear()
-    train(TrainConfig(**{**settings, "steps": 3}), [shared_sequence], tmp_path / "again", cache=cache)
-    again = [resolutions for training, resolutions in seen if training]
-    assert again == drawn[: len(again)]
-    seen.clear()
-    every = TrainConfig(**{**settings, "steps": 2}, draw_resolutions=False)
-    train(every, [shared_sequence], tmp_path / "all", cache=cache)
-    assert {resolutions for _, resolutions in seen} == {3}
-
-
-def test_frames_held_back_are_not_trained_on(shared_sequence: Path, tmp_path: Path) -> None:
-    def lengths(**changes: Any) -> tuple[list[int], list[int]]:
-        config = TrainConfig(**{**SMALL, **changes})
-        data = data_of(config, shared_sequence, cache=tmp_path / "cache")
-        return [len(shot) for shot in data.sampler.shots], [len(shot) for _, shot in data.watched]
-
-    # Shots of 4, 3, 2 and 1 frames, each without the last frames; none too short for a clip is kept.
-    assert lengths(start_every=1, validation_frames=1) == ([3, 2], [1])
-    assert lengths(start_every=1, validation_frames=2) == ([2], [2])
-    assert lengths(start_every=2, validation_frames=0) == ([4, 2], [])
-    # Too few frames to hold any back.
-    assert lengths(frames=3, validation_frames=2) == ([4], [])
-
-
-def test_every_noise_seed_of_the_noise_is_trained_on(small_sequence: Path, tmp_path: Path) -> None:
-    inputs = small_sequence / "inputs"
-    (inputs / "noise_seed1").mkdir()
-    for number in range(4):
-        shutil.copyfile(inputs / f"color{3 - number}.exr", inputs / "noise_seed1" / f"color{number}.exr")
-    config = TrainConfig(**SMALL)
-    data = data_of(config, small_sequence, validation=[small_sequence], cache=tmp_path / "cache")
-    assert [len(shot.colors) for shot in data.sampler.shots] == [2]
-    assert data.description["sequences"][0]["noise_seeds"] == 2
-    # Validation is always on the first.
-    assert "noise_seeds" not in data.description["validation_sequences"][0]
-    assert len(data.watched[1][1].colors) == 1
-
-
-def test_the_log_of_a_stopped_run_has_every_step_once(shared_sequence: Path, tmp_path: Path) -> None:
-    config, log = TrainConfig(**SMALL), tmp_path / "run" / "log.jsonl"
-
-    def stop_at_4(progress: Progress) -> None:
-        if progress.step == 4:
-            with log.open("a") as file:
-                file.write('{"step": 5, "lo')
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        train(config, [shared_sequence], tmp_path / "run", checkpoint_every=2, report=stop_at_4)
-    # The run is left as if the last checkpoint had been that of step 2.
-    saved = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
-    saved["step"] = 2
-    content = io.BytesIO()
-    torch.save(saved, content)
-    sealed = content.getvalue() + hashlib.sha256(content.getvalue()).digest()
-    (tmp_path / "run" / "checkpoint.pt").write_bytes(sealed)
-    train(config, [shared_sequence], tmp_path / "run", checkpoint_every=2)
-    entries = [json.loads(line) for line in log.read_text().splitlines()]
-    assert [entry.get("step", entry.get("first_step")) for entry in entries] == [0, 2, 2, 4, 6]
-
-
-def test_sequences_that_are_only_watched(small_sequence: Path, tmp_path: Path) -> None:
-    """They change what is reported and nothing that is learnt."""
-    other = tmp_path / "other"
-    shutil.copytree(small_sequence, other)
-    config = TrainConfig(**{**SMALL, "steps": 2, "validation_frames": 0})
-    reports: list[Progress] = []
-    plain = train(config, [small_sequence], tmp_path / "plain", report=reports.append)
-    watched = train(config, [small_sequence], tmp_path / "watched", validation=[other], report=reports.append)
-    assert [bool(progress.validation) for progress in reports] == [False, True]
-    assert describe_weights(watched)["sha256"] == describe_weights(plain)["sha256"]
-    data = json.loads((tmp_path / "watched" / "data.json").read_text())
-    assert [entry["name"] for entry in data["sequences"]] == ["plane"]
-    assert [entry["name"] for entry in data["validation_sequences"]] == ["other"]
-    # All frames of the sequence, as they are denoised when nothing is skipped, and no detail is given back.
-    whole, history, errors = load_weights(watched, DEFAULT), None, []
-    assert isinstance(whole, Restored)
-    model = whole.inner
-    assert isinstance(model, Demodulated)
-    model.inner.inner = model.inner.inner.inner
-    sequence = open_sequence(other)
-    for number in sequence.numbers:
-        frame = sequence.frame(number).validate()[0]
-        with torch.no_grad():
-            output, history = model(frame, history)
-        errors.append(smape_linear(output.image, frame.reference).item())
-    # The weights on disk are half precision.
-    assert reports[1].validation["smape"] == pytest.approx(sum(errors) / 4, abs=1e-3)
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
@@ -496,16 +328,6 @@ def test_two_trainings_do_not_share_a_folder(shared_sequence: Path, tmp_path: Pa
     train(config, [shared_sequence], run, checkpoint_every=1)
 
 
-@pytest.mark.parametrize("changed", [{"model": "cascaded_v2_tiny"}, {"ema": 0.5}], ids=["model", "average"])
-def test_a_checkpoint_of_another_architecture_is_refused(
-    again: Callable[..., Path], shared_sequence: Path, finished: Path, tmp_path: Path, changed: dict[str, Any]
-) -> None:
-    other = TrainConfig(**{**SMALL, "steps": 1, **changed})
-    train(other, [shared_sequence], tmp_path / "other", cache=finished / "cache")
-    shutil.copyfile(tmp_path / "other" / "checkpoint.pt", tmp_path / "run" / "checkpoint.pt")
-    assert refused(again).startswith(f"{tmp_path / 'run' / 'checkpoint.pt'}: expected a checkpoint of this run")
-
-
 def test_a_full_disk_keeps_the_checkpoint_before(again: Callable[..., Path], finished: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     for path in run.iterdir():
@@ -527,8 +349,7 @@ def test_a_gradient_that_is_not_finite_is_not_learnt_from(
     assert "training, step 0: expected a finite gradient, found inf" in message
 
 
-@pytest.mark.parametrize("stem", ["color", "reference"])
-@pytest.mark.parametrize("value", [3e38, 9e15, np.nan])
+@pytest.mark.parametrize(("stem", "value"), [("color", 3e38), ("reference", 9e15), ("color", np.nan)])
 def test_an_absurdly_bright_pixel_does_not_stop_a_run(
     small_sequence: Path, tmp_path: Path, value: float, stem: str
 ) -> None:
@@ -540,21 +361,6 @@ def test_an_absurdly_bright_pixel_does_not_stop_a_run(
     config = TrainConfig(**{**SMALL, "steps": 3}, exposure=10.0, tint=10.0)
     weights = train(config, [small_sequence], tmp_path / "run")
     assert all(tensor.isfinite().all() for tensor in load_file(weights).values())
-
-
-def test_a_batch_that_the_processes_cannot_divide_is_refused(
-    shared_sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    launched = {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "6", "LOCAL_WORLD_SIZE": "3"}
-    for name, value in launched.items():
-        monkeypatch.setenv(name, value)
-    message = refused(lambda: train(TrainConfig(**SMALL), [shared_sequence], tmp_path / "run"))
-    assert "batch: expected a multiple of the 6 processes, found 2" in message
-
-
-def test_no_sequences(tmp_path: Path) -> None:
-    assert "expected at least one sequence folder" in refused(lambda: train(TrainConfig(), [], tmp_path / "run"))
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -579,36 +385,6 @@ def test_data_that_cannot_be_trained_on_leaves_no_run(
     assert expected in refused(lambda: train(config, [small_sequence, broken], tmp_path / "run"))
     assert expected in refused(lambda: train(config, [small_sequence], tmp_path / "run", validation=[broken]))
     assert not (tmp_path / "run").exists()
-
-
-def test_frames_of_several_sizes_are_refused_and_sequences_of_several_sizes_are_not(
-    small_sequence: Path, tmp_path: Path
-) -> None:
-    other = tmp_path / "other"
-    shutil.copytree(small_sequence, other)
-    for path in (other / "inputs").glob("*.exr"):
-        image, channels, _ = read_exr(path)
-        if path.stem.endswith("3"):
-            write_exr(path, image[:17, :18], channels)
-    config = TrainConfig(**{**SMALL, "steps": 1})
-    message = refused(lambda: train(config, [small_sequence, other], tmp_path / "run"))
-    assert "expected 24 x 20 pixels like the first color file, found 18 x 17" in message
-    assert not (tmp_path / "run").exists()
-    for path in (other / "inputs").glob("*.exr"):
-        image, channels, _ = read_exr(path)
-        write_exr(path, image[:17, :18], channels, full_float="position" in path.stem)
-    assert train(config, [small_sequence, other], tmp_path / "run").exists()
-    message = refused(lambda: train(TrainConfig(**{**SMALL, "crop": 19}), [small_sequence, other], tmp_path / "large"))
-    assert "expected images of at least 19 pixels, found (17, 18)" in message
-
-
-def test_a_frame_that_is_damaged_leaves_no_run(small_sequence: Path, tmp_path: Path) -> None:
-    image, channels, _ = read_exr(small_sequence / "inputs" / "shading_normal1.exr")
-    write_exr(small_sequence / "inputs" / "shading_normal1.exr", image * float("nan"), channels)
-    run = tmp_path / "run"
-    message = refused(lambda: train(TrainConfig(**SMALL), [small_sequence], run))
-    assert f"{small_sequence}, frame 1: buffer 'normal': expected finite values" in message
-    assert [path.name for path in run.iterdir()] == ["cache"]
 
 
 BAD: dict[str, tuple[Any, ...]] = {
@@ -641,39 +417,6 @@ def test_settings_that_cannot_be_leave_no_run(shared_sequence: Path, tmp_path: P
     message = refused(lambda: train(TrainConfig(**{**SMALL, setting: value}), [shared_sequence], tmp_path / "run"))
     # What is wrong is named, with the value.
     assert str(value).partition("=")[0].partition(":")[0] in message
-    assert not (tmp_path / "run").exists()
-
-
-def test_only_exact_features(small_sequence: Path, tmp_path: Path) -> None:
-    """Normals of several points are shorter than one."""
-    sequence = open_sequence(small_sequence)
-    for number in sequence.numbers:
-        frame = sequence.frame(number)
-        assert frame.normal is not None
-        write_bmfr_frame(tmp_path / "mixed" / "inputs", number, frame.replace(normal=0.8 * frame.normal))
-    cameras = Path("inputs", "camera_matrices.h")
-    shutil.copy(small_sequence / cameras, tmp_path / "mixed" / cameras)
-    folders = [tmp_path / "mixed", small_sequence]
-    config = TrainConfig(**SMALL, exact_features=True)
-    data = data_of(config, *folders, validation=folders, cache=tmp_path / "cache")
-    assert [each["name"] for each in data.description["sequences"]] == ["plane"]
-    assert [each["name"] for each in data.description["validation_sequences"]] == ["plane"]
-    message = refused(lambda: data_of(config, folders[0], cache=tmp_path / "cache"))
-    assert "exact_features: expected a sequence with features without noise to train on, found none among 1" in message
-
-
-def test_a_folder_or_an_accelerator_that_cannot_be(shared_sequence: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    config = TrainConfig(**SMALL)
-    message = refused(lambda: train(config, [shared_sequence], tmp_path / "file" / "run"))
-    assert f"{tmp_path / 'file' / 'run' / 'cache'}" in message
-    message = refused(lambda: train(config, [shared_sequence], tmp_path / "file" / "run", cache=tmp_path / "cache"))
-    assert "expected a folder to write the run to" in message
-    for accelerator in ("abacus", "tpu"):
-        message = refused(lambda a=accelerator: train(config, [shared_sequence], tmp_path / "run", accelerator=a))
-        assert f"accelerator '{accelerator}': expected one that works here" in message
-    message = refused(lambda: train(config, [shared_sequence], tmp_path / "run", checkpoint_every=0))
-    assert "checkpoint_every: expected at least 1, found 0" in message
     assert not (tmp_path / "run").exists()
 
 

@@ -1,7 +1,5 @@
 """Files to read: those of real renderers, those with the names of others, and any that a test makes up."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,9 +8,6 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-
-from mcdenoise import InputError
-from mcdenoise.cli import main
 
 Image = np.ndarray[Any, Any]
 
@@ -52,28 +47,3 @@ def save() -> Callable[..., Path]:
         return path
 
     return written
-
-
-@pytest.fixture
-def refused() -> Callable[..., str]:
-    """The one line in which something is refused."""
-
-    def call(action: Callable[..., object], *arguments: Any, **options: Any) -> str:
-        with pytest.raises(InputError) as error:
-            action(*arguments, **options)
-        assert "\n" not in str(error.value)
-        return str(error.value)
-
-    return call
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Status, standard output and standard error of a command."""
-
-    def call(*arguments: Any) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as stop:
-            main([str(argument) for argument in arguments])
-        return (int(stop.value.code or 0), *capsys.readouterr())
-
-    return call

@@ -1,7 +1,5 @@
 """Cameras found from the positions that they see, and cameras checked by them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,7 @@ import pytest
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.data.images import read_channels
-from mcdenoise.data.readers.cameras import fault, fit_camera
-from mcdenoise.motion import convert, miss, motion_to, read_as
+from mcdenoise.data.readers.cameras import fit_camera
 
 Array = np.ndarray[Any, Any]
 HEIGHT, WIDTH = 54, 96
@@ -73,25 +70,6 @@ def test_the_camera_of_exact_positions() -> None:
     np.testing.assert_allclose(position @ found.matrix[:3, 3] + found.matrix[3, 3], depth, rtol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
-@pytest.mark.parametrize("offset", [(0, 0, 0), (1000.0, -500.0, 300.0)])
-def test_units_and_origin_of_the_world_do_not_matter(scale: float, offset: tuple[float, ...]) -> None:
-    position = (room(rays()) + offset) * scale
-    found = fit_camera(position, ALL)
-    # The error is that of 64-bit numbers, a thousand widths away.
-    assert miss(found.matrix, position, ALL) < 1e-6
-    np.testing.assert_allclose(found.eye / scale, EYE + offset, atol=1e-5)
-
-
-def test_a_camera_that_looks_from_all_sides() -> None:
-    for seed in range(8):
-        turn, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
-        position = room(rays()) @ turn * np.linalg.det(turn)
-        found = fit_camera(position, ALL)
-        assert found.error < 1e-6
-        np.testing.assert_allclose(found.eye, EYE @ turn * np.linalg.det(turn), atol=1e-5)
-
-
 def test_an_orthographic_camera() -> None:
     own = axes(EYE, TARGET, UP)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
@@ -116,46 +94,6 @@ def test_no_camera_is_found_from_points_of_one_plane() -> None:
     assert fit_camera(floor.astype(np.float32).astype(np.float64), down) is None
 
 
-def test_no_camera_is_found_in_other_images_than_positions() -> None:
-    random = np.random.default_rng(0)
-    assert fit_camera(random.standard_normal((HEIGHT, WIDTH, 3)), ALL) is None
-    assert fit_camera(np.zeros((HEIGHT, WIDTH, 3)), ALL) is None
-    assert fit_camera(room(rays()), np.zeros_like(ALL)) is None
-    few = np.zeros_like(ALL)
-    few[:3, :3] = True
-    assert fit_camera(room(rays()), few) is None
-    # Unit vectors, which a normal has, have no camera either.
-    vectors = random.standard_normal((HEIGHT, WIDTH, 3))
-    assert fit_camera(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), ALL) is None
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_one_in_five_points_elsewhere(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    position = room(rays())
-    elsewhere = random.random((HEIGHT, WIDTH)) < 0.2
-    position[elsewhere] += random.standard_normal((int(elsewhere.sum()), 3)) * 0.5
-    found = fit_camera(position, ALL)
-    assert np.abs(projected(room(rays()), found.matrix) - projected(room(rays()), matrix())).max() < 0.05
-
-
-def projected(position: Array, view_projection: Array) -> Array:
-    """Pixels from the corner of the image."""
-    clip = np.concatenate([position, np.ones_like(position[..., :1])], -1) @ view_projection
-    result: Array = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (WIDTH, HEIGHT)
-    return result
-
-
-def test_means_over_pixels() -> None:
-    random = np.random.default_rng(0)
-    samples = [room(rays(random.uniform(-0.5, 0.5, (HEIGHT, WIDTH, 2)))) for _ in range(16)]
-    position = np.mean(samples, 0)
-    found = fit_camera(position, ALL)
-    # A mean of 16 is off by 0.29 / 4 pixels in each direction; the camera is that of thousands of them.
-    assert found.error < 0.15
-    assert np.abs(projected(room(rays()), found.matrix) - projected(room(rays()), matrix())).max() < 0.1
-
-
 # Real renderers
 
 
@@ -177,40 +115,6 @@ def test_the_camera_of_blender(number: int, rendered: Path, others: Any) -> None
 
 
 # Conventions
-
-
-def test_how_a_matrix_is_written() -> None:
-    position, right = room(rays()), matrix()
-    for convention in ("", "y up", "transposed", "transposed, y up"):
-        # The convention names the steps that turn the matrix back: a mirror first, and then a transpose.
-        stored = right.copy()
-        if "y up" in convention:
-            stored[:, 1] *= -1
-        if "transposed" in convention:
-            stored = stored.T
-        found, error = read_as(stored, position, ALL)
-        assert found == convention
-        assert error < 1e-6
-        np.testing.assert_allclose(convert(stored, found), right)
-        assert stored is not convert(stored, found)
-    # Negated, it sees the same.
-    assert read_as(-right, position, ALL)[0] == ""
-    other = matrix(eye=np.add(EYE, (2, 0, 1)))
-    found, error = read_as(other, position, ALL)
-    assert found == "unknown"
-    assert error > 5
-
-
-def test_motion_of_still_points_under_a_moving_camera() -> None:
-    position, before = room(rays()), matrix(eye=np.add(EYE, (0.2, 0.1, 0)))
-    seen = ALL.copy()
-    seen[:5] = False
-    found = motion_to(before, position, seen)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    expected = projected(position, before) - np.stack([columns, rows], -1) - 0.5
-    np.testing.assert_allclose(found[seen], expected[seen], atol=1e-9)
-    assert np.isnan(found[~seen]).all()
-    assert np.abs(motion_to(matrix(), position, ALL)).max() < 1e-9
 
 
 @pytest.mark.parametrize("convention", ["", "y up", "transposed", "transposed, y up"])
@@ -244,21 +148,3 @@ def test_matrices_of_something_else_are_told(small_sequence: Path) -> None:
     (warning,) = open_sequence(small_sequence).warnings
     assert "camera_matrices.h" in warning
     assert "whichever way" in warning
-
-
-@pytest.mark.parametrize(
-    ("matrix", "reason"),
-    [
-        (np.zeros((4, 4)), "zeros"),
-        (np.ones((4, 4)), "singular"),
-        (np.diag([1.0, 0, 1, 1]), "singular"),
-        (np.full((4, 4), np.inf), "not finite"),
-        (np.eye(4), ""),
-        # No depth between planes of clipping.
-        (np.diag([1.0, 1, 0, 1]), ""),
-    ],
-)
-def test_a_matrix_that_no_camera_has_is_told_why(matrix: Any, reason: str) -> None:
-    found = fault(matrix)
-    assert reason in found
-    assert bool(found) is bool(reason)

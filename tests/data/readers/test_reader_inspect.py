@@ -1,21 +1,17 @@
 """`mcdenoise inspect` and `mcdenoise denoise` on what renderers wrote."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenEXR
 import pytest
+from commands import run
 
-Run = Callable[..., tuple[int, str, str]]
 
-
-def test_inspect_tells_a_file_what_it_prints_and_writes_nothing(run: Run, rendered: Path, tmp_path: Path) -> None:
+def test_inspect_tells_a_file_what_it_prints_and_writes_nothing(rendered: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(rendered / "blender", tmp_path / "shot")
     assert run("inspect", folder, "--json", tmp_path / "found.json")[::2] == (0, "")
     told = json.loads((tmp_path / "found.json").read_text())
@@ -26,7 +22,7 @@ def test_inspect_tells_a_file_what_it_prints_and_writes_nothing(run: Run, render
     assert len(list(folder.iterdir())) == 4
 
 
-def test_inspect_warns_on_standard_error(run: Run, others: Any, tmp_path: Path) -> None:
+def test_inspect_warns_on_standard_error(others: Any, tmp_path: Path) -> None:
     others.write("vray", tmp_path, frames=(1, 2, 4))
     status, text, errors = run("inspect", tmp_path)
     assert status == 0
@@ -36,45 +32,13 @@ def test_inspect_warns_on_standard_error(run: Run, others: Any, tmp_path: Path) 
     assert "3 frames, 1 to 4, of 64x36" in text
 
 
-def test_features_that_were_not_given_are_named(run: Run, rendered: Path) -> None:
-    luxcore = rendered / "luxcore"
-    status, text, errors = run("inspect", luxcore / "RGB_0001.exr")
-    assert status == 0
-    assert errors == (
-        "warning: RGB_0001.exr: read without ALBEDO_0001.exr, AVG_SHADING_NORMAL_0001.exr, DEPTH_0001.exr, "
-        "SHADING_NORMAL_0001.exr beside it, which look like features of the same frame; give these files too, or a "
-        "pattern or folder with all of them\n"
-    )
-    assert "ALBEDO" not in text
-    # Several features, or a deliberate choice, are read as they are.
-    for more in ((luxcore / "ALBEDO_0001.exr",), ("--map", "albedo=")):
-        assert run("inspect", luxcore / "RGB_0001.exr", *more)[::2] == (0, "")
-    status, _, errors = run("inspect", luxcore / "ALBEDO_0001.exr")
-    assert status == 2
-    assert "expected noisy radiance, found ALBEDO.RGB; give its file too, or name it with --map" in errors
-
-
-def test_both_flags_of_the_albedo_are_one_too_many(run: Run, rendered: Path) -> None:
-    status, _, errors = run("inspect", rendered / "blender", "--color-with-albedo", "--color-without-albedo")
-    assert status == 2
-    assert "expected one of them, found both" in errors
-    assert errors.count("\n") == 1
-    for flag, words in (
-        ("--color-with-albedo", "with albedo, as stated"),
-        ("--color-without-albedo", "without albedo"),
-    ):
-        status, text, errors = run("inspect", rendered / "blender", flag)
-        assert (status, errors) == (0, "")
-        assert words in " ".join(text.replace("│", " ").split())
-
-
 def channels(path: Path) -> dict[str, Any]:
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: each.pixels.copy() for part in file.parts for name, each in part.channels.items()}
 
 
 @pytest.mark.parametrize("option", [("--output-layer", "Clean"), ("--full-float",)])
-def test_a_shot_goes_in_and_comes_out(option: tuple[str, ...], run: Run, rendered: Path, tmp_path: Path) -> None:
+def test_a_shot_goes_in_and_comes_out(option: tuple[str, ...], rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "clean"
     status, text, errors = run(
         *("denoise", rendered / "blender" / "shot_####.exr", "-o", out, "--model", "accumulated", "--frames", "2-4"),

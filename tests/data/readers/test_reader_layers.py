@@ -1,19 +1,17 @@
 """Layers: groups of channels, which buffer their names denote, and the user's mapping."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import refuses
+from refusals import refused
 
-from mcdenoise.cli import main
 from mcdenoise.data import open_sequence
 from mcdenoise.data.images import Part, read_channels
-from mcdenoise.data.readers.choice import MAPPABLE, parse_mapping
-from mcdenoise.data.readers.layers import NAMES, fits, layers_of, named, recognise
+from mcdenoise.data.readers.layers import layers_of, recognise
 
 SIZE = (24, 32)
 
@@ -93,86 +91,6 @@ def test_the_names_of_every_renderer(renderer: str, channels: str, layer: str, b
     assert sum(len(each.channels) for each in layers) >= len(channels.split())
 
 
-@pytest.mark.parametrize("buffer", NAMES)
-def test_every_spelling_in_the_table_of_names_is_recognised(buffer: str) -> None:
-    for row in NAMES[buffer]:
-        for name in row.split():
-            layer = layers_of(0, "file", [part(f"{three(f'View.{name}')} x.y")])[0]
-            assert recognise(layer) == (buffer, [name in each.split() for each in NAMES[buffer]].index(True)), name
-
-
-@pytest.mark.parametrize(
-    ("label", "buffer"),
-    [
-        ("albedo", "albedo"),
-        ("kitchenAlbedo", "albedo"),
-        ("kitchen_albedo", "albedo"),
-        ("albedo_kitchen", "albedo"),
-        ("shot02_albedo", "albedo"),
-        ("Mogwai.GBufferRT.normW", "normal"),
-        ("AVG_SHADING_NORMAL", "normal"),
-        ("room_depth", "depth"),
-        ("vase", "color"),
-        ("kitchen", "color"),
-        ("hdr", "color"),
-        ("kitchenVariance", "variance"),
-        ("kitchenAlbedoVariance", None),
-        ("kitchen_normal_variance", None),
-        ("albedo_variance", None),
-        ("specular_albedo", None),
-        ("sample_count", None),
-        ("reference", "reference"),
-        ("光_albedo", "albedo"),
-    ],
-)
-def test_the_name_of_a_file_with_one_picture_decides_its_buffer(label: str, buffer: str | None) -> None:
-    (layer,) = layers_of(0, label, [part("B G R")])
-    assert layer.anonymous
-    assert layer.channels == ("R", "G", "B")
-    assert (recognise(layer) or (None,))[0] == buffer
-
-
-def test_channels_belong_together() -> None:
-    names = [
-        str(each)
-        for each in layers_of(0, "x", [part("A B G R Z Nx Ny Nz dzdx dzdy u v crypto.R id", "", "crypto.R id")])
-    ]
-    assert names == ["RGBA", "Z", "N.XYZ", "dzdx", "dzdy", "u", "v"]
-    assert [str(each) for each in layers_of(0, "x", [part("X Y Z other.T")])] == ["XYZ", "other.T"]
-    assert [str(each) for each in layers_of(0, "x", [part("red green blue other.T")])] == ["RGB", "other.T"]
-    assert [str(each) for each in layers_of(0, "flow", [part("u v")])] == ["flow.UV"]
-
-
-def test_parts_name_their_layers() -> None:
-    parts = [part("R G B A", "beauty"), part("R G B", "albedo"), part("Z", "depth"), part("X Y Z", "shading normal")]
-    layers = layers_of(0, "render", parts)
-    assert [(str(each), each.part) for each in layers] == [
-        ("beauty.RGBA", 0),
-        ("albedo.RGB", 1),
-        ("depth.Z", 2),
-        ("shading normal.XYZ", 3),
-    ]
-    assert [(recognise(each) or ("",))[0] for each in layers] == ["color", "albedo", "depth", "normal"]
-
-
-@pytest.mark.parametrize(
-    ("buffer", "channels", "does"),
-    [
-        ("color", "c.R c.G c.B", True),
-        ("color", "c.R c.G", False),
-        ("depth", "c.Z", True),
-        ("depth", "c.R c.G c.B", True),
-        ("depth", "c.X c.Y c.Z", False),
-        ("motion", "c.X c.Y", True),
-        ("motion", "c.X", False),
-        ("variance", "c.R", True),
-        ("variance", "c.R c.G", False),
-    ],
-)
-def test_channels_that_a_buffer_needs(buffer: str, channels: str, does: bool) -> None:
-    assert fits(buffer, layers_of(0, "", [part(f"{channels} other.T")])[0]) is does
-
-
 # The user's mapping
 
 
@@ -208,17 +126,6 @@ def test_a_layer_is_asked_for_in_any_of_its_forms(text: str, layered: Path) -> N
     assert row.reading.startswith("as asked for")
 
 
-def test_channels_of_several_layers_make_a_buffer(layered: Path) -> None:
-    sequence = open_sequence(layered, mapping=["albedo=c.R,a.R,b.R"], color_has_albedo=True)
-    expected = read_channels(layered, {0: ["c.R", "a.R", "b.R"]})[0]
-    np.testing.assert_array_equal(sequence.frame(7).albedo[0].permute(1, 2, 0).numpy(), expected)
-
-
-def test_a_buffer_can_be_done_without(layered: Path) -> None:
-    assert open_sequence(layered).buffers == {"color", "alpha", "depth"}
-    assert open_sequence(layered, mapping=["depth="]).buffers == {"color", "alpha"}
-
-
 @pytest.mark.parametrize(
     ("texts", "expected"),
     [
@@ -234,38 +141,9 @@ def test_a_buffer_can_be_done_without(layered: Path) -> None:
         (["length=N1"], "expected BUFFER=LAYER"),
     ],
 )
-def test_layers_that_cannot_be_requested(
-    texts: list[str], expected: str, layered: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
-) -> None:
+def test_layers_that_cannot_be_requested(texts: list[str], expected: str, layered: Path) -> None:
     assert expected in refused(open_sequence, layered, mapping=texts)
-    with pytest.raises(SystemExit) as stop:
-        main(["inspect", str(layered), *[each for text in texts for each in ("--map", text)]])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert expected in error
-    assert error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("channels", "lights", "expected"),
-    [
-        ("R G B DiffDir.R DiffDir.G DiffDir.B", "Glow", "found none; choose among DiffDir.RGB"),
-        ("R G B Sun.R Sun.G Sun.B a~b.R a~b.G a~b.B", "all", "found none; name them: --layers Sun.RGB 'a b.RGB'"),
-        ("R G B Sun.R Sun.G Sun.B", "Sun,Sky", "separate names by spaces: --layers Sun Sky; or choose among Sun.RGB"),
-        ("R G B", "all", "found none; omit the option"),
-        ("R G B", "Glow", "found none; omit the option"),
-    ],
-)
-def test_lights_that_cannot_be_requested(
-    channels: str, lights: str, expected: str, save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
-) -> None:
-    path = save(tmp_path / "a.exr", {name.replace("~", " "): np.ones(SIZE) for name in channels.split()})
-    assert refused(open_sequence, path, lights=(lights,)).endswith(expected)
-
-
-def test_every_buffer_can_be_asked_for() -> None:
-    assert parse_mapping([f"{buffer} = Some Layer" for buffer in MAPPABLE]) == dict.fromkeys(MAPPABLE, "Some Layer")
-    assert {"color", "albedo", "normal", "depth", "position", "motion", "reference"} <= set(MAPPABLE)
+    assert expected in refuses("inspect", layered, *[each for text in texts for each in ("--map", text)])
 
 
 @pytest.mark.parametrize(
@@ -276,7 +154,7 @@ def test_every_buffer_can_be_asked_for() -> None:
     ],
 )
 def test_two_colors_are_refused_with_the_option_that_decides(
-    channels: str, flags: list[str], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
+    channels: str, flags: list[str], save: Callable[..., Path], tmp_path: Path
 ) -> None:
     path = save(tmp_path / "a.exr", {name: np.ones(SIZE) for name in channels.split()})
     message = refused(open_sequence, path)
@@ -316,26 +194,8 @@ def test_of_two_depths_that_of_the_positions_is_taken(
     assert list(open_sequence(tmp_path / "b.exr", mapping=[f"depth={names[1]}"]).warnings) == []
 
 
-def test_two_layers_of_a_feature_are_no_reason_to_refuse(save: Callable[..., Path], tmp_path: Path) -> None:
-    random = np.random.default_rng(0)
-    names = "R G B albedo.R albedo.G albedo.B diffuse_albedo.R diffuse_albedo.G diffuse_albedo.B"
-    channels = {name: random.random(SIZE) for name in names.split()}
-    path = save(tmp_path / "a.exr", channels)
-    sequence = open_sequence(path, color_has_albedo=True)
-    (warning,) = sequence.warnings
-    assert "--map albedo=diffuse_albedo" in warning
-    np.testing.assert_allclose(sequence.frame(0).albedo[0, 0], channels["albedo.R"], rtol=1e-6)
-    for flag in ("albedo=albedo", "albedo=diffuse_albedo", "albedo="):
-        assert list(open_sequence(path, mapping=[flag], color_has_albedo=True).warnings) == []
-    # Equal ones are one.
-    channels |= {f"diffuse_albedo.{each}": channels[f"albedo.{each}"] for each in "RGB"}
-    assert list(open_sequence(save(path, channels), color_has_albedo=True).warnings) == []
-
-
 @pytest.mark.parametrize("folder", ["blender_stereo", "blender5_stereo"])
-def test_each_eye_is_an_image_of_its_own(
-    folder: str, rendered: Path, tmp_path: Path, refused: Callable[..., str]
-) -> None:
+def test_each_eye_is_an_image_of_its_own(folder: str, rendered: Path, tmp_path: Path) -> None:
     path = rendered / folder / "shot_0001.exr"
     message = refused(open_sequence, path)
     assert "ViewLayer.Combined.left.RGBA, shot_0001.exr ViewLayer.Combined.right.RGBA; choose" in message
@@ -389,15 +249,7 @@ def test_layers_of_no_known_name_are_told_by_their_values(
     assert "normal" not in open_sequence(tmp_path / "a.exr", mapping=["normal="]).buffers
 
 
-def test_no_radiance_at_all(save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_no_radiance_at_all(save: Callable[..., Path], tmp_path: Path) -> None:
     path = save(tmp_path / "a.exr", {"Depth.Z": np.ones(SIZE), "N.X": np.ones(SIZE)})
     assert "expected noisy radiance, found" in refused(open_sequence, path)
     assert "name it with --map color=LAYER" in refused(open_sequence, path)
-
-
-def test_named_takes_the_whole_name_first() -> None:
-    layers = layers_of(0, "", [part(f"{three('Albedo')} {three('View.Albedo')} {three('View.Albedo.left')}")])
-    assert [str(each) for each in named(layers, "Albedo")] == ["Albedo.RGB"]
-    assert [str(each) for each in named(layers, "View.Albedo")] == ["View.Albedo.RGB"]
-    assert [str(each) for each in named(layers, "left")] == ["View.Albedo.left.RGB"]
-    assert named(layers, "bedo") == []

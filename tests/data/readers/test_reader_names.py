@@ -1,15 +1,13 @@
 """File names: which files a folder, a file or a pattern stands for, and which digits count the frames."""
 
-from __future__ import annotations
-
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from mcdenoise.data import open_sequence, write_exr
+from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.names import find_files, group_files, pattern_of
 
 SIZE = (8, 12)
@@ -60,10 +58,7 @@ def image(save: Callable[..., Path], tmp_path: Path) -> Callable[..., list[Path]
             ["shot02_0012_albedo", "shot02_0013_albedo", "shot02_0012", "shot02_0013"],
             {"shot02_####_albedo": [12, 13], "shot02_####": [12, 13]},
         ),
-        (
-            ["shot01_0001", "shot01_0002", "shot02_0001", "shot02_0002"],
-            {"shot01_####": [1, 2], "shot02_####": [1, 2]},
-        ),
+        (["shot01_0001", "shot01_0002", "shot02_0001", "shot02_0002"], {"shot01_####": [1, 2], "shot02_####": [1, 2]}),
         (["color", "albedo"], {"color": [0], "albedo": [0]}),
         (["render_0007", "albedo"], {"render_0007": [7], "albedo": [7]}),
         (["render_0007", "albedo_0007", "normal"], {"render_0007": [7], "albedo_0007": [7], "normal": [7]}),
@@ -81,17 +76,7 @@ def test_which_digits_count_the_frames(names: list[str], expected: dict[str, lis
     )
 
 
-def test_suffixes_and_folders_keep_kinds_apart() -> None:
-    assert groups("a.1.hdr", "a.2.hdr", "a_albedo.1.png", "a_albedo.2.png") == {
-        "a.#.hdr": {1: "a.1.hdr", 2: "a.2.hdr"},
-        "a_albedo.#.png": {1: "a_albedo.1.png", 2: "a_albedo.2.png"},
-    }
-    assert len(groups("a_0001.EXR", "a_0002.exr")) == 1
-    found, _ = group_files([D / "color" / "0001.exr", D / "albedo" / "0001.exr"])
-    assert len(found) == 2
-
-
-def test_two_files_of_a_frame_are_refused(refused: Callable[..., str]) -> None:
+def test_two_files_of_a_frame_are_refused() -> None:
     message = refused(group_files, [D / "shot_0001.exr", D / "shot_1.exr"])
     assert "shot_1.exr: expected one file a frame, found shot_0001.exr as well" in message
 
@@ -129,14 +114,6 @@ def test_patterns(pattern: str, expected: list[str] | None, image: Callable[...,
     assert {path.name for path in find_files([tmp_path / folder])} == set(names)
 
 
-def test_several_inputs_are_taken_once(image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    one, two, _ = image("a_0001.exr", "a_0002.exr", "b_0001.exr")
-    assert find_files([two, tmp_path / "a_####.exr", one]) == [two, one]
-    sequence = open_sequence([two, one])
-    assert sequence.numbers == [1, 2]
-    assert [float(sequence.frame(number).color[0, 0, 0, 0]) for number in (1, 2)] == [1, 2]
-
-
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
@@ -155,7 +132,7 @@ def test_several_inputs_are_taken_once(image: Callable[..., list[Path]], tmp_pat
     ],
 )
 def test_paths_and_patterns_without_files(
-    given: Sequence[str], expected: str, image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
+    given: Sequence[str], expected: str, image: Callable[..., list[Path]], tmp_path: Path
 ) -> None:
     image("a_0001.exr")
     (tmp_path / "empty").mkdir()
@@ -170,34 +147,7 @@ def test_paths_and_patterns_without_files(
 # Shots
 
 
-@pytest.mark.parametrize(("start", "digits"), [(0, 1), (1, 4), (97, 2), (1001, 4), (0, 9)])
-def test_any_start_and_padding(start: int, digits: int, image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    numbers = range(start, start + 4)
-    image(*[f"shot/render.{number:0{digits}d}.exr" for number in numbers])
-    sequence = open_sequence(tmp_path / "shot")
-    assert (sequence.numbers, sequence.name, list(sequence.warnings)) == (list(numbers), "shot", [])
-    assert [float(sequence.frame(number).color[0, 0, 0, 0]) for number in numbers] == [1, 2, 3, 4]
-    (tmp_path / "out").mkdir()
-    path = sequence.write(tmp_path / "out", start + 2, np.ones((*SIZE, 3), np.float32))
-    assert path.name == f"render.{start + 2:0{digits}d}.exr"
-
-
-def test_gaps_are_told(image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    image(*[f"shot/a_{number:03d}.exr" for number in (3, 4, 6, 10, 11)])
-    sequence = open_sequence(tmp_path / "shot")
-    assert sequence.numbers == [3, 4, 6, 10, 11]
-    (warning,) = sequence.warnings
-    assert warning.startswith("frames: 5, 7-9 missing;")
-    # Gaps are intended if the user selects frames.
-    assert list(open_sequence(tmp_path / "shot", "3,10-11").warnings) == []
-    image(*[f"many/a_{number}.exr" for number in range(0, 40, 2)])
-    (warning,) = open_sequence(tmp_path / "many").warnings
-    assert "1, 3, 5, 7, 9, 11, 13, 15 and 11 more missing" in warning
-
-
-def test_two_shots_are_refused_with_the_option_that_decides(
-    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
-) -> None:
+def test_two_shots_are_refused_with_the_option_that_decides(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(*[f"all/shot{shot:02d}_{number:04d}.exr" for shot in (1, 2) for number in (1, 2)])
     message = refused(open_sequence, tmp_path / "all")
     assert "found shot01_####.exr, shot02_####.exr; choose" in message
@@ -232,21 +182,6 @@ def test_buffers_of_a_still(names: list[str], image: Callable[..., list[Path]], 
     assert float(sequence.frame(sequence.numbers[0]).color[0, 0, 0, 0]) == 1
 
 
-def test_tungsten_writes_a_file_a_buffer(image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    buffers = ("", "Albedo", "Normal", "Depth")
-    image(*[f"kitchen/kitchen{buffer}{end}.exr" for buffer in buffers for end in ("", "Variance")])
-    sequence = open_sequence(tmp_path / "kitchen")
-    assert {row.buffer: row.source for row in sequence.table} == {
-        "color": "kitchen.exr",
-        "albedo": "kitchenAlbedo.exr",
-        "normal": "kitchenNormal.exr",
-        "depth": "kitchenDepth.exr",
-        "variance": "kitchenVariance.exr",
-    }
-    # The names say whose variance it is.
-    assert float(sequence.frame(0).variance[0, 0, 0, 0]) == 2
-
-
 def test_the_layout_of_oidn(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(
         *[f"training/{name}_0008spp.{kind}.exr" for name in ("bath", "kitchen") for kind in ("hdr", "alb", "nrm")],
@@ -268,64 +203,10 @@ def test_the_layout_of_oidn(image: Callable[..., list[Path]], tmp_path: Path) ->
     assert (alone.layout, alone.numbers) == ("oidn", [0])
 
 
-def test_a_buffer_that_some_frames_lack_is_told(
-    image: Callable[..., list[Path]], tmp_path: Path, refused: Callable[..., str]
-) -> None:
+def test_a_buffer_that_some_frames_lack_is_told(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image("a_0001.exr", "a_0002.exr", "a_0003.exr", "a_albedo_0001.exr", "a_albedo_0003.exr")
     message = refused(open_sequence, tmp_path)
     assert "a_albedo_####.exr: expected buffer 'albedo' for every frame, found none for frame 2" in message
     assert "leave the buffer out with --map albedo=" in message
     assert open_sequence(tmp_path, mapping=["albedo="]).buffers == {"color"}
     assert open_sequence(tmp_path, "1,3").buffers == {"color", "albedo"}
-
-
-@pytest.mark.parametrize("letter", ["a", "n", "p", "z", "N", "x", "[a]", "a:b", "%s%n"])
-def test_a_shot_may_have_a_letter_for_a_name(letter: str, image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    image(f"s/{letter}_1.exr", f"s/{letter}_2.exr", f"s/{letter}_albedo_1.exr", f"s/{letter}_albedo_2.exr")
-    assert open_sequence(tmp_path / "s").buffers == {"color", "albedo"}
-    # A letter stands for its buffer if there is radiance beside it.
-    image("t/beauty_1.exr", f"t/{letter}_1.exr")
-    meaning = {"a": "alpha", "n": "normal", "p": "position", "z": "depth"}.get(letter.lower())
-    taken = {row.buffer: row.source for row in open_sequence(tmp_path / "t").table}
-    assert taken["color"] == "beauty_1.exr"
-    assert meaning is None or taken[meaning] == f"{letter}_1.exr"
-
-
-def test_links_are_files(image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    (path,) = image("data/a.exr")
-    (tmp_path / "shot").mkdir()
-    for number in (1, 2):
-        (tmp_path / "shot" / f"a_{number}.exr").symlink_to(path)
-    (tmp_path / "link").symlink_to(tmp_path / "shot")
-    assert open_sequence(tmp_path / "link").numbers == [1, 2]
-
-
-def test_files_and_frames_of_other_sizes_are_told(
-    image: Callable[..., list[Path]], save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]
-) -> None:
-    image("s/a_1.exr", "s/a_2.exr", "s/albedo_1.exr", "s/albedo_2.exr")
-    save(tmp_path / "s" / "a_2.exr", dict.fromkeys("RGB", np.ones((8, 13))))
-    assert "a_2.exr: expected 12 x 8 pixels like the first color file, found 13 x 8" in refused(
-        open_sequence, tmp_path / "s"
-    )
-    shutil.copy(tmp_path / "s" / "a_1.exr", tmp_path / "s" / "a_2.exr")
-    save(tmp_path / "s" / "albedo_2.exr", dict.fromkeys("RGBX", np.ones(SIZE)))
-    save(tmp_path / "s" / "albedo_1.exr", dict.fromkeys("RGB", np.ones((9, 12))))
-    assert "albedo_1.exr: expected 'albedo' in the pixels of the color" in refused(open_sequence, tmp_path / "s")
-
-
-def test_negative_numbers_count_where_no_word_goes_before(image: Callable[..., list[Path]], tmp_path: Path) -> None:
-    image(*[f"all/shot_{number}.exr" for number in ("-0002", "-0001", "0000", "0001")])
-    assert open_sequence(tmp_path / "all").numbers == [-2, -1, 0, 1]
-    image(*[f"dash/shot-{number:04d}.exr" for number in (1, 2)])
-    assert open_sequence(tmp_path / "dash").numbers == [1, 2]
-
-
-def test_two_shots_of_the_same_layers_are_told_by_their_files(tmp_path: Path, refused: Callable[..., str]) -> None:
-    pixels = np.ones((8, 8, 6), np.float32)
-    for shot in ("one", "other"):
-        write_exr(
-            tmp_path / f"{shot}_0001.exr", pixels, [f"View.{n}.{c}" for n in ("Combined", "DiffCol") for c in "RGB"]
-        )
-    message = refused(open_sequence, tmp_path)
-    assert "found one_0001.exr View.Combined.RGB, other_0001.exr View.Combined.RGB; give only the files of" in message

@@ -1,7 +1,5 @@
 """Diffuse and specular light from files: used where it adds up to the color, refused in words where it does not."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import run
+from refusals import refused
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.images import read_channels, read_image_header
@@ -18,7 +18,6 @@ from mcdenoise.models import create_model, save_weights
 
 SIZE = (12, 16)
 Save = Callable[..., Path]
-Run = Callable[..., tuple[int, str, str]]
 Image = np.ndarray[Any, Any]
 
 # Blender's passes, and which buffer each belongs to.
@@ -104,13 +103,6 @@ def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Sav
     assert not open_sequence(save(tmp_path / "both_0001.exr", both)).warnings
 
 
-def test_diffuse_light_alone_gives_no_parts_and_no_warning(tmp_path: Path, save: Save) -> None:
-    channels, _ = blender(*BLENDER["specular"])
-    sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels))
-    assert "diffuse" not in sequence.buffers
-    assert not sequence.warnings
-
-
 @pytest.mark.parametrize("layout", ["layers", "files", "files of a shot"])
 @pytest.mark.parametrize("emits", [False, True])
 def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
@@ -138,51 +130,6 @@ def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, 
     assert (frame.emission is not None) == emits
 
 
-def test_emission_that_is_in_the_specular_light_already(tmp_path: Path, save: Save) -> None:
-    diffuse, specular = drawn(0), drawn(1)
-    light = {"": diffuse + specular, "diffuse": diffuse, "specular": specular, "emission": specular / 2}
-    channels = {k.lstrip("."): v for name, image in light.items() for k, v in three(name, image).items()}
-    frame = open_sequence(save(tmp_path / "a_0001.exr", channels)).frame(1)
-    np.testing.assert_array_equal(image_of(frame, "specular"), specular)
-    assert frame.emission is None
-
-
-def test_layers_can_be_mapped(tmp_path: Path, save: Save) -> None:
-    matt, shiny = drawn(0), drawn(1)
-    light = {"Combined": matt + shiny, "matt": matt, "shiny": shiny, "other": drawn(2)}
-    path = save(
-        tmp_path / "a_0001.exr", {k: v for n, image in light.items() for k, v in three(f"V.{n}", image).items()}
-    )
-    frame = open_sequence(path, mapping=["diffuse=matt", "specular=shiny"]).frame(1)
-    np.testing.assert_array_equal(image_of(frame, "diffuse"), matt)
-    wrong = open_sequence(path, mapping=["diffuse=matt", "specular=other"])
-    assert wrong.warnings
-    assert wrong.frame(1).specular is None
-
-
-def test_mapping_diffuse_to_nothing_disables_the_parts(tmp_path: Path, save: Save) -> None:
-    channels, _ = blender("Emit")
-    path = save(tmp_path / "shot_0001.exr", channels)
-    assert open_sequence(path).warnings
-    assert not open_sequence(path, mapping=["diffuse="]).warnings
-
-
-def test_pixels_that_are_no_numbers_do_not_spoil_a_frame(tmp_path: Path, save: Save) -> None:
-    """A firefly beyond all numbers is mended in the color, and the parts are whatever a method may look at."""
-    channels, _ = blender()
-    # One pixel of 10,000, as in an image: of these 192 it would be too many.
-    channels = {name: np.tile(image, (8, 8)) for name, image in channels.items()}
-    for name in ("View.Combined.R", "View.GlossDir.R"):
-        channels[name][3, 4] = np.inf
-    channels["View.DiffInd.G"][5, 6] = np.nan
-    path = save(tmp_path / "shot_0001.exr", channels)
-    frame, replaced = open_sequence(path, color_has_albedo=True).frame(1).validate()
-    assert replaced == 1
-    assert frame.diffuse is not None
-    assert frame.specular is not None
-    assert bool(torch.isfinite(frame.diffuse).all() and torch.isfinite(frame.specular).all())
-
-
 def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path, save: Save) -> None:
     channels, _ = blender()
     save(tmp_path / "shot_0001.exr", channels)
@@ -193,20 +140,8 @@ def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path, s
         assert sequence.frame(2).diffuse is None
 
 
-def test_a_frame_without_a_pass_leaves_all_without(tmp_path: Path, save: Save) -> None:
-    save(tmp_path / "shot_0001.exr", blender()[0])
-    save(tmp_path / "shot_0002.exr", blender("Emit")[0])
-    assert "diffuse" not in open_sequence(tmp_path).buffers
-
-
-def test_the_parts_are_read_on_request_only(tmp_path: Path, save: Save) -> None:
-    sequence = open_sequence(save(tmp_path / "shot_0001.exr", blender()[0]))
-    assert sequence.frame(1, buffers={"albedo"}).diffuse is None
-    assert sequence.frame(1, buffers={"specular"}).diffuse is not None
-
-
 @pytest.mark.parametrize("split", [True, False])
-def test_kpcn_filters_both_parts_of_a_real_file(run: Run, rendered: Path, tmp_path: Path, split: bool) -> None:
+def test_kpcn_filters_both_parts_of_a_real_file(rendered: Path, tmp_path: Path, split: bool) -> None:
     settings = {"width": 4, "layers": 2, "kernel_size": 3, "split": split}
     torch.manual_seed(0)
     weights = tmp_path / "kpcn.safetensors"
@@ -264,29 +199,7 @@ def test_all_layers_are_those_that_complete_the_sum(kind: str, save: Callable[..
     torch.testing.assert_close(sum(frame.layers.values()), frame.color, rtol=4e-3, atol=1e-3)
 
 
-def test_layers_of_any_names_are_chosen_if_they_add_up(save: Callable[..., Path], tmp_path: Path) -> None:
-    sun, sky, lamp = shares(3)
-    groups = {"Sun": sun, "Sky": sky, "Lamp": lamp}
-    color = sun + sky + lamp
-    # The same light divided in another way.
-    fraction = np.random.default_rng(2).random(color.shape).astype(np.float32)
-    others = {"one": color * fraction, "two": color * (1 - fraction)}
-    for layers, expected in (
-        (groups, [*groups]),
-        (others, [*others]),
-        (groups | others, [*groups]),
-        ({"one": others["one"]} | groups | {"two": others["two"]}, None),
-    ):
-        path = save(tmp_path / f"{len(layers)}" / "a.exr", as_channels({"": color} | layers))
-        sequence = open_sequence(path, lights=("all",))
-        assert (
-            sorted(sequence.lights) == sorted(expected) if expected else set(sequence.lights) in ({*groups}, {*others})
-        )
-        frame = sequence.frame(0)
-        torch.testing.assert_close(sum(frame.layers.values()), frame.color)
-
-
-def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path) -> None:
     diffuse, glossy, coat = shares(3)
     channels = as_channels({"": diffuse + glossy + coat, "DiffuseThing": diffuse, "diffuse_direct": diffuse})
     sequence = open_sequence(save(tmp_path / "a.exr", channels), lights=("all",))

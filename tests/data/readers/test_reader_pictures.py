@@ -1,7 +1,5 @@
 """Pictures that are no EXR, and those of one channel: read in the color space that they state, and written in it."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -10,12 +8,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from commands import run
 
 from mcdenoise.data import open_sequence
 
 Image = np.ndarray[Any, Any]
 SIZE = (12, 16)
-Run = Callable[..., tuple[int, str, str]]
 
 
 def picture(path: Path, kind: str, channels: int = 3, **attributes: Any) -> Image:
@@ -122,16 +120,14 @@ def test_the_color_space_of_a_picture_is_kept(
     np.testing.assert_allclose(after, before, rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("names", ["Y", "Y A", "Y Z", "L", "grey.V", "beauty.Y depth.Z", "lightmap"])
-def test_one_channel_is_denoised_and_written_as_one(
-    names: str, run: Run, save: Callable[..., Path], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("names", ["Y", "Y A", "beauty.Y depth.Z"])
+def test_one_channel_is_denoised_and_written_as_one(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     channels = {name: np.ones(SIZE, np.float32) for name in names.split()}
     first = next(iter(channels))
     channels[first] = random.gamma(3, 1 / 6, SIZE).astype(np.float32)
     path = save(tmp_path / "ao_0001.exr", channels)
-    status, text, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "oidn_tuned", "--threads", "1")
+    status, text, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "oidn_tuned_small", "--threads", "1")
     assert (status, errors) == (0, "")
     # One loud line says what is missing.
     assert text.count("NO FEATURES") == ("Z" not in names)
@@ -147,13 +143,7 @@ def test_one_channel_is_denoised_and_written_as_one(
             np.testing.assert_array_equal(pixels[..., place], channels[name])
 
 
-def test_a_single_channel_is_no_color_beside_a_picture(save: Callable[..., Path], tmp_path: Path) -> None:
-    channels = {name: np.full(SIZE, 0.5 + i / 10) for i, name in enumerate(["R", "G", "B", "Y", "noisy.V"])}
-    sequence = open_sequence(save(tmp_path / "a.exr", channels))
-    assert [float(each) for each in sequence.frame(0).color[0, :, 0, 0]] == pytest.approx([0.5, 0.6, 0.7])
-
-
-@pytest.mark.parametrize("names", ["XYZ", "XYZA", "Y", "YA"])
+@pytest.mark.parametrize("names", ["XYZA", "Y"])
 def test_the_color_in_another_space_is_written_too(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
     """Mitsuba's films write XYZ or luminance beside the RGB of the nested integrator: never half of a file."""
     to_xyz = np.array([[0.412453, 0.35758, 0.180423], [0.212671, 0.71516, 0.072169], [0.019334, 0.119193, 0.950227]])

@@ -1,7 +1,5 @@
 """Single samples of pixels from files: layers of an EXR whose mean is its color."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import run
 
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
@@ -17,7 +16,6 @@ from mcdenoise.frame import Frame
 
 COUNT, SIZE = 3, (12, 16)
 Save = Callable[..., Path]
-Run = Callable[..., tuple[int, str, str]]
 Image = np.ndarray[Any, Any]
 
 
@@ -70,13 +68,6 @@ def test_a_file_of_their_own_comes_back(tmp_path: Path, channels: int, layout: s
     assert sequence.frame(4, buffers=()).samples is None
 
 
-def test_the_features_of_samples_are_no_buffers(tmp_path: Path) -> None:
-    samples = drawn(10)
-    write_exr(tmp_path / "color_0004.exr", picture(samples), ["R", "G", "B"], full_float=True)
-    write_samples(tmp_path / "samples_0004.exr", samples)
-    assert open_sequence(tmp_path).buffers == {"color", "samples"}
-
-
 @pytest.mark.parametrize("layout", ["files", "bmfr"])
 def test_samples_whose_mean_is_not_the_color_are_not_used(tmp_path: Path, layout: str) -> None:
     samples = drawn()
@@ -94,18 +85,8 @@ def test_samples_whose_mean_is_not_the_color_are_not_used(tmp_path: Path, layout
     assert sequence.frame(4).samples is None
 
 
-def test_frames_without_samples_leave_all_without(tmp_path: Path, save: Save) -> None:
-    samples = drawn()
-    save(tmp_path / "shot_0001.exr", in_color(samples))
-    fewer = {name: image for name, image in in_color(samples).items() if not name.startswith("sample2")}
-    save(tmp_path / "shot_0002.exr", fewer)
-    sequence = open_sequence(tmp_path)
-    assert sequence.warnings == ["'samples': some frames have others, or of other pixels, or none: not used"]
-    assert sequence.frame(1).samples is None
-
-
 @pytest.mark.parametrize("model", ["sbmc", "layered"])
-def test_methods_of_samples_run_on_those_of_files(run: Run, save: Save, tmp_path: Path, model: str) -> None:
+def test_methods_of_samples_run_on_those_of_files(save: Save, tmp_path: Path, model: str) -> None:
     samples = drawn()
     for number in (1, 2):
         save(tmp_path / "in" / f"shot_000{number}.exr", in_color(samples))

@@ -1,10 +1,7 @@
 """Images are decoded in strips of as many rows as compression takes together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -31,18 +28,6 @@ def test_strips_are_the_rows_of_the_image(save: Callable[..., Path], tmp_path: P
         np.testing.assert_array_equal(whole, np.stack([rows + 2, rows], -1))
     for some in (slice(-16, None), slice(3, 40), slice(0, HEIGHT + 9)):
         np.testing.assert_array_equal(read_channels(path, {0: ["B", "R"]}, some)[0], whole[some])
-
-
-def test_a_layer_that_is_the_color_but_for_its_first_rows_is_no_twin(save: Callable[..., Path], tmp_path: Path) -> None:
-    color = np.random.default_rng(0).random((40, 24), dtype=np.float32)
-    other = color.copy()
-    other[0, 0] += 1
-    channels: dict[str, Any] = {f"Combined.{c}": color for c in "RGB"}
-    channels |= {f"same.{c}": color for c in "RGB"} | {f"near.{c}": other for c in "RGB"}
-    opened = open_sequence(save(tmp_path / "a.exr", channels))
-    (row,) = opened.table
-    assert "the same as same.RGB," in row.reading
-    assert "near" not in row.reading
 
 
 def test_light_of_display_values_is_made_linear_like_the_color(save: Callable[..., Path], tmp_path: Path) -> None:

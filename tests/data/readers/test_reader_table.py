@@ -1,7 +1,5 @@
 """Every renderer: which layer is read as which buffer without a flag, and that the values are those of the scene."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -135,44 +133,3 @@ def test_the_values_of_blender(number: int, rendered: Path) -> None:
     # The sky is so far away that it moves with the camera's turning alone, and is seen where it is.
     position = pixels(frame.position)
     np.testing.assert_allclose(projected(position, frame.view_projection), center(position), atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("renderer", "eye", "target", "up", "row", "near"),
-    [
-        # Means over a pixel, in 16 bits.
-        ("mitsuba/frame.####.exr", (-0.5, 1.5, 5.0), (0, 0.9, 0), (0, 1, 0), 0, 0.05),
-        # Points anywhere within half a pixel of the centre, each a row below where the camera sees it.
-        ("luxcore", (-0.5, -5.0, 1.5), (0, 0, 0.9), (0, 0, 1), 1, 0.25),
-    ],
-)
-def test_positions_move_as_the_known_camera_does(
-    renderer: str,
-    eye: tuple[float, ...],
-    target: tuple[float, ...],
-    up: tuple[float, ...],
-    row: int,
-    near: float,
-    rendered: Path,
-) -> None:
-    sequence = open_sequence(rendered / renderer)
-    frames = {number: sequence.frame(number) for number in sequence.numbers}
-    for number in sequence.numbers[1:]:
-        position = pixels(frames[number].position)
-        hit = np.isfinite(pixels(frames[number].depth)[..., 0])
-        there = projected(position, frames[number - 1].view_projection)
-        known = looking_at(np.add(eye, (0.15 * (number - 1), 0, 0)), np.array(target), np.array(up), position)
-        known += (0, row)
-        assert np.median(np.linalg.norm(there - known, axis=-1)[hit]) < near
-        # They move by twice as much at least.
-        assert np.median(np.linalg.norm(known - center(position), axis=-1)[hit]) > 2 * near
-
-
-def looking_at(eye: Image, target: Image, up: Image, position: Image) -> Image:
-    """Pixels at which a camera with 50 degrees in the width sees positions."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-    x, y, z = np.moveaxis((position - eye) @ np.stack([right, np.cross(forward, right), forward]).T, -1, 0)
-    height, width = position.shape[:2]
-    focal = width / 2 / np.tan(np.radians(25))
-    return np.stack([width / 2 + focal * x / z, height / 2 + focal * y / z], -1) - 0.5

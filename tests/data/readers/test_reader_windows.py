@@ -1,7 +1,5 @@
 """Data windows that differ between frames or parts of one display window."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -87,17 +85,6 @@ def test_each_file_is_written_in_its_own_window(cropped: Path, tmp_path: Path, o
             np.testing.assert_array_equal(old[name], new[f"clean.{name}"])
 
 
-def test_void_pixels_give_no_light_and_take_none(cropped: Path, tmp_path: Path) -> None:
-    for number, (top, left, height, width) in enumerate(WINDOWS):
-        flat = {name: np.full((height, width), 0.5, np.float32) for name in "RGB"}
-        OpenEXR.File([part(flat, top, left)]).write(str(cropped / f"shot_{number:04d}.exr"))
-    denoise_sequence(open_sequence(cropped), tmp_path / "out", Denoiser("joint_bilateral"), "joint_bilateral")
-    for path in (tmp_path / "out").glob("*.exr"):
-        ((_, channels),) = stored(path)
-        for name in "RGB":
-            np.testing.assert_allclose(channels[name], 0.5, rtol=1e-3)
-
-
 def test_a_cropped_feature_is_placed_where_it_belongs(tmp_path: Path) -> None:
     albedo = {f"albedo.{name}": np.full((10, 12), 0.25, np.float32) for name in "RGB"}
     path = tmp_path / "shot.exr"
@@ -121,10 +108,3 @@ def test_another_display_window_is_refused(cropped: Path) -> None:
     OpenEXR.File([other]).write(str(cropped / "shot_0001.exr"))
     with pytest.raises(InputError, match=r"shot_0001\.exr"):
         open_sequence(cropped)
-
-
-def test_a_cropped_reference_is_refused(tmp_path: Path) -> None:
-    OpenEXR.File([part(radiance(*DISPLAY, 0), 0, 0)]).write(str(tmp_path / "shot_0001.exr"))
-    OpenEXR.File([part(radiance(10, 12, 0), 8, 20)]).write(str(tmp_path / "reference_0001.exr"))
-    with pytest.raises(InputError, match=r"reference_0001\.exr"):
-        open_sequence(tmp_path)

@@ -118,11 +118,7 @@ def ball(center, radius, rings=24, segments=48):
     for ring in range(rings + 1):
         for segment in range(segments + 1):
             polar, azimuth = math.pi * ring / rings, 2 * math.pi * segment / segments
-            normal = (
-                math.sin(polar) * math.cos(azimuth),
-                math.sin(polar) * math.sin(azimuth),
-                math.cos(polar),
-            )
+            normal = (math.sin(polar) * math.cos(azimuth), math.sin(polar) * math.sin(azimuth), math.cos(polar))
             normals.append(normal)
             points.append(tuple(c + radius * n for c, n in zip(center, normal, strict=True)))
             uvs.append((segment / segments, ring / rings))

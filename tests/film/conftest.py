@@ -1,0 +1,8 @@
+import pytest
+from shots import Inline
+
+
+@pytest.fixture
+def inline(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`mcdenoise film` makes its pieces in this process, which starts at once."""
+    monkeypatch.setattr("mcdenoise.cli.film.open_engine", lambda workers, **options: Inline())
