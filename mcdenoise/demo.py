@@ -28,7 +28,7 @@ from mcdenoise.sequence_report import SequenceReport
 
 FRAMES = 12
 SIZE = (320, 180)
-REFERENCE_SPP = 128
+REFERENCE_SPP = 64
 REFERENCE_FRAMES = (10, 11)
 # Open Image Denoise in the setting that has the smallest errors on sequences, see docs/results.md.
 PEER = "oidn(quality=high, auxiliary=clean, source=accumulated after)"
