@@ -284,7 +284,7 @@ def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path, monkeypatc
     monkeypatch.delenv(PYTHON_VARIABLE, raising=False)
     if importlib.util.find_spec("bpy") is not None:
         pytest.skip("this Python has bpy")
-    with pytest.raises(InputError, match=r"bpy.*--blender-python$"):
+    with pytest.raises(InputError, match=r"bpy.*BLENDER_PYTHON$"):
         generate(tmp_path, renderer="cycles", seeds="0", frames=1, assets="none")
     with pytest.raises(InputError, match="nothing that runs"):
         Blender(tmp_path / "python")

@@ -49,14 +49,14 @@ class Blender:
             self._said.close()
             raise InputError(
                 f"{self.python}: expected a Python that has Blender's module bpy, found nothing that runs "
-                f"({error.strerror}); name one with --blender-python"
+                f"({error.strerror}); name one by {PYTHON_VARIABLE}"
             ) from error
         answer = self._answer()
         if "ok" not in answer:
             self.close()
             raise InputError(
                 f"{self.python}: expected a Python that has Blender's module bpy, found none "
-                f"({answer['error']}); pip install bpy==4.5.15 into a Python 3.11 and name it with --blender-python"
+                f"({answer['error']}); pip install bpy==4.5.15 into a Python 3.11 and name it by {PYTHON_VARIABLE}"
             )
         self.version: str = answer["ok"]
 
