@@ -5,7 +5,8 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import LARGEST_RADIANCE, Frame
+from mcdenoise.frame import Frame
+from mcdenoise.light import LARGEST_RADIANCE
 from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import CHANNELS, LeakyUNet, SampleEmbedding, samples_of
 
