@@ -296,7 +296,8 @@ def test_histories_of_layers_have_the_weights_of_the_color_s() -> None:
     state, glossy = None, []
     for seed in range(4):
         color = 0.5 + torch.rand(1, 3, 20, 24, generator=torch.Generator().manual_seed(seed))
-        color[..., 10, 12] *= 1000
+        # Once: light that stays is no firefly.
+        color[..., 10, 12] *= 1000 if seed == 2 else 1
         part = color * torch.rand(1, 3, 20, 24, generator=torch.Generator().manual_seed(9 + seed))
         output, state = model(still(color, layers={"glossy": part, "rest": color - part}), state)
         glossy.append(part)

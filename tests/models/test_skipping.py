@@ -97,9 +97,10 @@ SHOTS: dict[str, tuple[Callable[[int], Frame], dict[str, float]]] = {
 }
 
 
-@pytest.mark.parametrize("shot", SHOTS)
-@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
-def test_exact_skipping_changes_no_pixel(shot: str, precision: Any) -> None:
+@pytest.mark.parametrize(
+    ("precision", "shot"), [*(("float32", shot) for shot in SHOTS), ("bfloat16", "at rest"), ("bfloat16", "half sky")]
+)
+def test_exact_skipping_changes_no_pixel(precision: Any, shot: str) -> None:
     make, expected = SHOTS[shot]
     model = small("cascaded_v2", tolerance=0)
     short, whole = Denoiser(model, precision=precision), Denoiser(model, precision=precision, keep_all=True)
