@@ -26,10 +26,10 @@ from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import render_sequence
 from mcdenoise.sequence_report import SequenceReport
 
-FRAMES = 12
+FRAMES = 10
 SIZE = (320, 180)
 REFERENCE_SPP = 64
-REFERENCE_FRAMES = (10, 11)
+REFERENCE_FRAMES = (8, 9)
 # Open Image Denoise in the setting that has the smallest errors on sequences, see docs/results.md.
 PEER = "oidn(quality=high, auxiliary=clean, source=accumulated after)"
 # Beside the baselines and the chosen model: a filter of each kind, Open Image Denoise, and models with shipped weights.
@@ -68,7 +68,7 @@ def run_demo(
     on_frame: Callable[[], None] = lambda: None,
     on_compare: Callable[[int, int], None] = lambda done, total: None,
 ) -> DemoResult:
-    """Render 12 frames at one sample a pixel, denoise them, and compare the last ones with references.
+    """Render 10 frames at one sample a pixel, denoise them, and compare the last ones with references.
 
     Frames that an earlier run rendered into the same folder are used again; its report is replaced.
 

@@ -1,6 +1,6 @@
 """Train a run of a recipe for a given number of minutes, however fast the machine is.
 
-    python examples/gpu/train.py TAKES... -o OUT --recipe recipes/cascaded_v3.toml --run small --minutes 8
+    python examples/gpu/train.py TAKES... -o OUT --recipe recipes/wild.toml --run base --minutes 8
 
 TAKES are folders of packed takes, or of sequences. Some steps are timed first, in OUT/pace; then as many as the minutes
 allow run with the recipe's schedule, in OUT/run, which ends with the weights, the checkpoint with the optimiser, and

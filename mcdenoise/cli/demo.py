@@ -16,7 +16,7 @@ from mcdenoise.models import DEFAULT
 
 
 def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
-    """Render 12 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
+    """Render 10 frames of a small scene at one sample per pixel, denoise them, and print errors and run times.
 
     Then compare the error and the run time of several models, filters and installed denoisers in a report.
 
