@@ -225,7 +225,8 @@ class _Exact:
             terms = layer.weight.numel() / layer.out_channels
             if isinstance(layer, nn.ConvTranspose2d):
                 terms /= math.prod(layer.stride)
-            return result + unit * math.sqrt(terms / 2) * spread * signs
+            rounded: Tensor = result + unit * math.sqrt(terms / 2) * spread * signs
+            return rounded
 
         handles = [layer.register_forward_hook(change) for layer in self._squared]
         try:
