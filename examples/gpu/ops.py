@@ -19,7 +19,7 @@ from part import Part, difference
 from torch import Tensor
 
 from mcdenoise.benchmark.operators import enlarged, largest_case
-from mcdenoise.check.case import Inputs, Op, as_tuple, map_tensors
+from mcdenoise.check.case import Inputs, Op, as_tuple, map_tensors, tensors_in
 from mcdenoise.check.cases import OPS
 from mcdenoise.ops import use
 
@@ -75,10 +75,8 @@ def timed(part: Part, name: str, size: tuple[int, int], copy: float) -> dict[str
             row[f"{form}, gradients"] = part.milliseconds(partial(differentiated, call, inputs, settings), rounds=5)
     with torch.inference_mode():
         results: Sequence[Tensor] = as_tuple(function(**inputs, **settings))
-    moved = sum(each.nbytes for each in results)
-    tensors: list[Tensor] = []
-    map_tensors(lambda tensor: tensors.append(tensor) or tensor, inputs)  # type: ignore[func-returns-value]
-    return {**row, "copy": {"ms": round((moved + sum(each.nbytes for each in tensors)) * copy, 4)}}
+    moved = sum(each.nbytes for each in (*tensors_in(inputs), *results))
+    return {**row, "copy": {"ms": round(moved * copy, 4)}}
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
+from mcdenoise.check.case import tensors_in
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import DTYPES, relative_error
 from mcdenoise.data.files import new_folder
@@ -219,12 +220,12 @@ def largest_case(op: Op) -> Case:
     """The ordinary case of one image, of more than one pixel, with the most values a pixel; in RGB if there is one."""
 
     def size(case: Case) -> tuple[bool, float]:
-        tensors, (height, width) = _tensors(case.inputs()), _size(case)
+        tensors, (height, width) = tensors_in(case.inputs()), _size(case)
         in_rgb = any(tensor.ndim == 4 and tensor.shape[1] == 3 for tensor in tensors)
         return in_rgb, sum(tensor.numel() for tensor in tensors) / (height * width)
 
     def is_one_image(case: Case) -> bool:
-        return max(_size(case)) > 1 and all(tensor.shape[0] == 1 for tensor in _tensors(case.inputs()))
+        return max(_size(case)) > 1 and all(tensor.shape[0] == 1 for tensor in tensors_in(case.inputs()))
 
     return max((case for case in op.cases if case.kind == "ordinary" and is_one_image(case)), key=size)
 
@@ -263,24 +264,13 @@ def _size(case: Case) -> tuple[int, int]:
     if "size" in case.settings:
         height, width = case.settings["size"]
         return height, width
-    sizes = [tuple(tensor.shape[-2:]) for tensor in _tensors(case.inputs()) if tensor.ndim == 4]
+    sizes = [tuple(tensor.shape[-2:]) for tensor in tensors_in(case.inputs()) if tensor.ndim == 4]
     height, width = max(sizes)
     return height, width
 
 
-def _tensors(inputs: Inputs) -> list[Tensor]:
-    found: list[Tensor] = []
-
-    def note(tensor: Tensor) -> Tensor:
-        found.append(tensor)
-        return tensor
-
-    map_tensors(note, inputs)
-    return found
-
-
 def _bytes(inputs: Inputs) -> int:
-    return sum(tensor.nbytes for tensor in _tensors(inputs))
+    return sum(tensor.nbytes for tensor in tensors_in(inputs))
 
 
 def _error(entry: _Entry, device: str) -> float:

@@ -117,6 +117,18 @@ def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
     return {name: apply(value) for name, value in inputs.items()}
 
 
+def tensors_in(inputs: Inputs) -> list[Tensor]:
+    """The tensors of a case's inputs, in order."""
+    found: list[Tensor] = []
+
+    def note(tensor: Tensor) -> Tensor:
+        found.append(tensor)
+        return tensor
+
+    map_tensors(note, inputs)
+    return found
+
+
 def as_tuple(results: Any) -> tuple[Tensor, ...]:
     """The results of an op, of which there may be one or several."""
     return (results,) if isinstance(results, Tensor) else tuple(results)

@@ -67,6 +67,12 @@ def entries(value: Any) -> Iterator[dict[str, Any]]:
             yield from entries(item)
 
 
+def in_another_process(code: str) -> subprocess.CompletedProcess[str]:
+    """Run a program that can import this file."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False, timeout=120)
+
+
 # The same again
 
 
@@ -76,14 +82,7 @@ def test_the_same_seed_is_the_same_scene_in_any_process() -> None:
     assert here == [digest(seed) for seed in seeds]
     assert len(set(here)) == len(seeds)
     code = f"from test_places import digest\nprint(*(digest(seed) for seed in {seeds}))"
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    child = in_another_process(code)
     assert child.stdout.split() == here, child.stderr
 
 
@@ -103,14 +102,7 @@ def test_a_longer_shot_begins_like_a_shorter_one() -> None:
 
 def test_making_a_scene_needs_no_mitsuba() -> None:
     code = "import sys\nfrom test_places import drawn\ndrawn(0)\nprint(*{'mitsuba', 'drjit'} & set(sys.modules))"
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    child = in_another_process(code)
     assert (child.returncode, child.stdout.strip()) == (0, ""), child.stderr
 
 

@@ -40,7 +40,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check import gradients
-from mcdenoise.check.case import Case, Inputs, Op, as_tuple, map_tensors
+from mcdenoise.check.case import Case, Inputs, Op, as_tuple, map_tensors, tensors_in
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
@@ -78,7 +78,7 @@ class _Trial:
     @property
     def leaves(self) -> list[Tensor]:
         """The tensors that are rounded; surfaces are not, because they are only compared."""
-        return _leaves(self.numbers)
+        return tensors_in(self.numbers)
 
     @property
     def images(self) -> list[str]:
@@ -265,7 +265,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     leaves, tiny = [leaf.double() for leaf in trial.leaves], torch.finfo(trial.inner).tiny
     values = {name: value for name, value in inputs.items() if name in trial.numbers}
     values |= {name: value for name, value in rounded.items() if name in values}
-    magnitudes = _leaves(map_tensors(lambda tensor: tensor.abs() + tiny, values))
+    magnitudes = tensors_in(map_tensors(lambda tensor: tensor.abs() + tiny, values))
     conditions = _conditions(trial.run, leaves, magnitudes, trial.inner, at_once=trial.op.batched)
     return [
         _bounded(value, condition + lost, fan_in, trial.inner, result.dtype)
@@ -288,7 +288,7 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
         largest = max((leaf.abs().max().item() for leaf in exact[len(trial.leaves) :] if leaf.numel()), default=0.0)
         conditions = [
             (change / unit / _DEPTH + largest * term, torch.zeros_like(change))
-            for change, term in zip(changes, _leaves(terms), strict=True)
+            for change, term in zip(changes, tensors_in(terms), strict=True)
         ]
     # If a result is rightly infinite, its derivative may be infinite or NaN; otherwise it must be finite. What must be
     # finite in any case stays as it is, so that it is reported.
@@ -299,12 +299,6 @@ def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact])
         condition = torch.where(excused, condition, 0)
         bounded.append(_bounded(torch.where(excused, value, 0), condition, fan_in, trial.dtype, trial.dtype))
     return bounded
-
-
-def _leaves(inputs: Inputs) -> list[Tensor]:
-    found: list[Tensor] = []
-    map_tensors(lambda tensor: found.append(tensor) or tensor, inputs)  # type: ignore[func-returns-value]
-    return found
 
 
 def _conditions(
