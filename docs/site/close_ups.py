@@ -1,6 +1,6 @@
 """Close-ups for the pages of methods: ``python docs/site/close_ups.py DEMO`` writes ``docs/close_ups/``.
 
-DEMO is what ``mcdenoise demo -o DEMO`` wrote. Each method that needs no training denoises its 16 frames.
+DEMO is what ``mcdenoise demo -o DEMO`` wrote. Each method that needs no training denoises its frames.
 ``METHOD.webp`` has two crops of the last frame, of the noisy image and of the reference; ``errors.csv`` has the errors
 of that frame.
 """

@@ -30,33 +30,18 @@ WEIGHTS = {
     "to train": "none; to be trained",
     "none": "none",
 }
-# How the tables of measurements call the methods.
+# How the tables of measurements call some methods.
 NAMES = {
-    "NBGD": "nbgd",
-    "RAE (for ONND)": "rae",
-    "KP": "kp",
-    "MRKP": "mrkp",
-    "WSKP": "wskp",
-    "P+K": "cascaded",
-    "KPCN": "kpcn",
-    "SBMC": "sbmc",
-    "layered": "layered",
-    "ANF": "anf",
-    "NPPD": "nppd",
-    "SVGF": "svgf",
-    "A-SVGF": "asvgf",
-    "BMFR": "bmfr",
-    "joint bilateral": "joint_bilateral",
     "joint bilateral, best of 20 settings": "joint_bilateral",
     "OIDN": "oidn",
     "OIDN, best of 36 settings": "oidn",
 }
 PAPER = "*The paper* is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
-MEASURED = ("results.md", "unseen_scenes.md", "zoo.md", "layers.md")
-# Tables whose second column is the run time of network and filters: page, heading, anchor and machine.
+MEASURED = ("results.md", "performance.md", "zoo.md", "layers.md")
+# Tables of the run time of network and filters at 1280x720: page, heading, anchor, column and machine.
 RUN_TIMES = (
-    ("zoo.md", "Table 2: time at 1280x720", "table-2-time-at-1280x720", "an AMD EPYC"),
-    ("results.md", "Run time side by side", "run-time-side-by-side", "an Intel Xeon"),
+    ("zoo.md", "Trained on equal terms", "trained-on-equal-terms", 5, "an AMD EPYC"),
+    ("performance.md", "Run time side by side", "run-time-side-by-side", 1, "an Intel Xeon"),
 )
 
 
@@ -84,8 +69,8 @@ def index(entries: list[ModelOverview]) -> str:
     """All methods, by what makes their image."""
     parts = [
         "# Methods\n\nEvery method is a name that `--model` and `Denoiser` take, and one file in `mcdenoise/models/`, "
-        "to be read beside its paper. What it costs are multiply-adds in convolutions; [The zoo](../zoo.md) compares "
-        "errors, and [Results](../results.md) has those of the default. `mcdenoise models` prints this list."
+        "to be read beside its paper. Its cost is in multiply-adds of convolutions. [The zoo](../zoo.md) and "
+        "[Results](../results.md) compare errors. `mcdenoise models --all` prints this list."
     ]
     for kind, title in KINDS.items():
         rows = [
@@ -107,12 +92,12 @@ def cost(entry: ModelOverview) -> str:
 
 def run_time(name: str) -> str:
     """Milliseconds of a method at 1280x720, from the tables of the docs, or a dash."""
-    for source, title, anchor, machine in RUN_TIMES:
+    for source, title, anchor, column, machine in RUN_TIMES:
         for heading, _, rows in tables(ROOT / "docs" / source):
             for row in rows if heading == title else []:
-                if method_of(row[0]) == name:
+                if method_of(row[0]) == name and row[column]:
                     return (
-                        f"{row[1]} ms at 1280x720 for network and filters, float32, two cores of {machine} "
+                        f"{row[column]} ms at 1280x720 for network and filters, float32, two cores of {machine} "
                         f"([how it was measured](../{source}#{anchor}))"
                     )
     return "-"
@@ -159,9 +144,10 @@ def close_up(name: str) -> str:
     smape, psnr = found[name]
     return (
         f"![Two crops: noisy, {name}, reference](../close_ups/{name}.webp){{ .pixels width=100% }}\n\n"
-        f"Frame 15 of `mcdenoise demo`: one sample a pixel on the left, `{name}` in the middle, the reference of 128 "
-        f"samples on the right. Over the whole frame its SMAPE is {smape} and its PSNR {psnr} dB, where the noisy "
-        f"frame has {found['noisy'][0]} and {found['noisy'][1]} dB. `python docs/site/close_ups.py demo` measured it."
+        f"The last frame of a demo of 16 frames: one sample a pixel on the left, `{name}` in the middle, the reference "
+        f"of 128 samples on the right. Over the whole frame its SMAPE is {smape} and its PSNR {psnr} dB, where the "
+        f"noisy frame has {found['noisy'][0]} and {found['noisy'][1]} dB. `python docs/site/close_ups.py demo` makes such "
+        "pictures of the frames of `mcdenoise demo`."
     )
 
 

@@ -33,8 +33,8 @@ def index() -> str:
             "# Operators\n",
             "Functions of `mcdenoise.ops`: tensors in, tensors out, no weights and no files. Each is differentiable, "
             "to any order; half precision is summed in float32. [Kornia](../kornia.md) says what each stands on, and "
-            "[Compose your own](../compose.md) puts them together. `mcdenoise models --ops` prints this list with "
-            "errors.\n",
+            "[For researchers](../for-researchers.md) puts them together. `mcdenoise models --ops` prints this list "
+            "with errors.\n",
             "| operator | what it does | Module twin |",
             "|---|---|---|",
             *rows,
