@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.sequences import Sequence
+from mcdenoise.data import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid

@@ -7,8 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.data import open_sequence
-from mcdenoise.data.sequences import Sequence
+from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.shards import Shard, find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcdenoise.data import open_sequence
+from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.readers import noisebase
 from mcdenoise.data.readers.noisebase import open_noisebase
-from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 
 zarr = pytest.importorskip("zarr")

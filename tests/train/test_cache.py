@@ -11,10 +11,9 @@ import pytest
 import torch
 from refusals import full_disk
 
-from mcdenoise.data import open_sequence
+from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_buffer
-from mcdenoise.data.sequences import Sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Output, create_model

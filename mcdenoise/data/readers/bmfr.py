@@ -28,7 +28,7 @@ from mcdenoise.data.readers.layers import Layer, layers_of
 from mcdenoise.data.readers.names import FileGroup, find_files, pattern_of
 from mcdenoise.data.readers.opening import check_files
 from mcdenoise.data.readers.samples import SampleLayers, split_samples, write_samples
-from mcdenoise.data.readers.source import Source
+from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
@@ -102,16 +102,14 @@ class _BmfrFolder(RenderedFiles):
     def unused(self) -> list[str]:
         return _others(self.path)
 
-    def frame_files(self, number: int) -> list[Path]:
+    def _files(self, number: int) -> list[Path]:
         description = self.path / _DESCRIPTION
-        return super().frame_files(number) + ([description] if description.is_file() else [])
+        return super()._files(number) + ([description] if description.is_file() else [])
 
-    def frame(
-        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
-    ) -> Frame:
+    def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
         if noise_seed:
-            return replace(self, groups=self.more[noise_seed - 1]).frame(number, reference=reference, buffers=buffers)
-        return super().frame(number, reference=reference, buffers=buffers)
+            return replace(self, groups=self.more[noise_seed - 1])._frame(number, reference, 0, buffers)
+        return super()._frame(number, reference, 0, buffers)
 
     def as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
         if not self.color_has_albedo:
@@ -151,7 +149,7 @@ class _BmfrFolder(RenderedFiles):
 
     def check_output_layer(self, name: str) -> None:
         # There are no layers.
-        Source.check_output_layer(self, name)
+        FrameSequence.check_output_layer(self, name)
 
     def target(self, source: Path) -> str:
         """The name of a result: ``denoisedN.exr``."""
@@ -209,7 +207,7 @@ def open_bmfr(
     files: Files,
     choose_numbers: Callable[[list[int]], list[int]],
     color_has_albedo: bool | None = None,
-) -> Source:
+) -> RenderedFiles:
     """Check the selected frames of a folder by file names and headers, and the values of the first frame.
 
     Args:

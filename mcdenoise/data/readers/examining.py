@@ -83,7 +83,7 @@ def _as_tensor(image: Image) -> Tensor:
 
 
 def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list[str], stated: bool | None) -> None:
-    if shot.part(shot.choice.layers["color"]).display_referred:
+    if shot.part_of(shot.choice.layers["color"]).display_referred:
         words.append("display values, made linear")
         shot.warnings.append(
             "'color': 8 or 16 bits of display values: what was brighter than white is lost; render floats, or say "

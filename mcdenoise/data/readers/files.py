@@ -24,7 +24,7 @@ from mcdenoise.data.readers.lights import is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.samples import SampleLayers
-from mcdenoise.data.readers.source import Source
+from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -40,7 +40,7 @@ _LOSSY = 1e-3
 
 
 @dataclass
-class RenderedFiles(Source):
+class RenderedFiles(FrameSequence):
     """Frames of one shot; made by :func:`mcdenoise.data.readers.opening.open_files`.
 
     Args:
@@ -78,7 +78,7 @@ class RenderedFiles(Source):
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
-        return self.part(self.choice.layers["color"]).size if self.window is None else self.window.size
+        return self.part_of(self.choice.layers["color"]).size if self.window is None else self.window.size
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -125,25 +125,20 @@ class RenderedFiles(Source):
         layer = self.choice.layers.get("reference")
         return [] if layer is None else [number for number in self.numbers if self.has(layer, number)]
 
-    def frame_files(self, number: int) -> list[Path]:
+    def _files(self, number: int) -> list[Path]:
         """The files of one frame with layers in use, without files that hold only a reference."""
         used = {layer for name, layer in self.choice.layers.items() if name != "reference"}
         groups = {layer.group for layer in {*used, *self.choice.written, *self._further} if self.has(layer, number)}
         cameras = [folder / MATRICES for folder in self.folders] if self.cameras is not None else []
         return [self.groups[group].files[number] for group in groups] + [path for path in cameras if path.is_file()]
 
-    def metadata(self, number: int) -> Metadata:
-        """Attributes of one frame's color file."""
+    def _metadata(self, number: int) -> Metadata:
         return read_image_header(self.file(self.choice.layers["color"], number)).metadata
 
-    def reference(self, number: int) -> Tensor:
-        """Read the reference of one frame that has one."""
+    def _reference(self, number: int) -> Tensor:
         return as_tensor(self.read_buffers(number, ["reference"])["reference"])
 
-    def frame(
-        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
-    ) -> Frame:
-        """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`."""
+    def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
         split = self.split if buffers is None or self.split is None or self.split.names & set(buffers) else None
         samples = self.samples if buffers is None or "samples" in buffers else None
         names = [
@@ -173,7 +168,7 @@ class RenderedFiles(Source):
         return frame if single is None else frame.replace(samples=single)
 
     def check_output_layer(self, name: str) -> None:
-        """See :meth:`mcdenoise.data.Sequence.check_output_layer`."""
+        """Check that the file has the layer to add a layer to, and none of this name."""
         layer = self.choice.written[0]
         path = self.file(layer, self.numbers[0])
         if path.suffix.lower() not in EXR_SUFFIXES:
@@ -181,24 +176,22 @@ class RenderedFiles(Source):
         if not name.strip() or "." in name or not name.isprintable():
             raise InputError(f"--output-layer: expected a name without dots, found {name!r}")
         prefix = ".".join((*layer.family, name))
-        taken = [each for each in self.part(layer).channels if each == prefix or each.startswith(f"{prefix}.")]
+        taken = [each for each in self.part_of(layer).channels if each == prefix or each.startswith(f"{prefix}.")]
         if taken:
             raise InputError(
                 f"{path}: expected a new name for --output-layer, found '{taken[0]}' in the file; choose another"
             )
 
-    def write(
+    def _write(
         self,
         out: Path,
         number: int,
         image: Image,
-        *,
-        alpha: Image | None = None,
-        lights: Mapping[str, Image] | None = None,
-        output_layer: str | None = None,
-        full_float: bool = False,
+        alpha: Image | None,
+        lights: Mapping[str, Image],
+        output_layer: str | None,
+        full_float: bool,
     ) -> Path:
-        """Write the files of a frame with the denoised image; see :meth:`mcdenoise.data.Sequence.write`."""
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         inside: dict[tuple[int, str], Image] = {}
@@ -217,7 +210,7 @@ class RenderedFiles(Source):
         if alpha is not None:
             own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]
             files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
-        for group, channels in self._lights(number, lights or {}).items():
+        for group, channels in self._lights(number, lights).items():
             files[group] |= channels
         for group in {layer.group, *files}:
             source, ours = self.groups[group].files[number], group == layer.group
@@ -320,7 +313,7 @@ class RenderedFiles(Source):
         found = fit_camera(images["position"], self.known(images))
         return None if found is None else found.matrix
 
-    def part(self, layer: Layer) -> Part:
+    def part_of(self, layer: Layer) -> Part:
         """The part that contains a layer, in the first file of its kind."""
         return self.parts[layer.group][layer.part]
 
@@ -369,7 +362,7 @@ class RenderedFiles(Source):
 
     def in_world(self, number: int, position: Image) -> Image:
         """Convert camera-space positions to world space by the attribute ``worldToCamera``; 0 is no position."""
-        to_camera = world_to_camera(self.metadata(number))
+        to_camera = world_to_camera(self._metadata(number))
         if to_camera is None:
             raise InputError(
                 f"{self.file(self.choice.layers['color'], number)}: expected the attribute 'worldToCamera', as "
@@ -391,8 +384,8 @@ class RenderedFiles(Source):
                 f"{self.file(layer, number)}: expected {width} x {height} pixels like the first color file, found "
                 f"{found_width} x {found_height}; render all buffers and frames at one size"
             )
-        if self.part(layer).display_referred and layer not in others:
-            pixels = np.concatenate([decode(pixels[..., :3], self.part(layer).gamma), pixels[..., 3:]], -1)
+        if self.part_of(layer).display_referred and layer not in others:
+            pixels = np.concatenate([decode(pixels[..., :3], self.part_of(layer).gamma), pixels[..., 3:]], -1)
         return pixels
 
 

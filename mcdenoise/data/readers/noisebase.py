@@ -24,7 +24,7 @@ import torch
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Mask, Metadata, write_exr
 from mcdenoise.data.readers.names import group_files
-from mcdenoise.data.readers.source import Source
+from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -163,17 +163,17 @@ class _Arrays:
 
 
 @dataclass
-class _NoisebaseFiles(Source):
+class _NoisebaseFiles(FrameSequence):
     """Frames of one sequence; made by :func:`open_noisebase`.
 
     Args:
-        files: the zip of each frame.
+        zips: the zip of each frame.
         shapes: shape of every array of a zip, of the same names and shapes in all; empty for those that are not read.
         view: size of the full image of the matrices, and whether the files' crop offset applies; ``None`` if positions
             are not projected to their pixels either way.
     """
 
-    files: Mapping[int, Path]
+    zips: Mapping[int, Path]
     shapes: Mapping[str, tuple[int, ...]]
     view: tuple[tuple[int, int], bool] | None = None
 
@@ -194,7 +194,7 @@ class _NoisebaseFiles(Source):
 
     @property
     def folders(self) -> set[Path]:
-        return {path.parent for path in self.files.values()}
+        return {path.parent for path in self.zips.values()}
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -214,28 +214,23 @@ class _NoisebaseFiles(Source):
     def unused(self) -> list[str]:
         return sorted(self.shapes.keys() - _IMAGES.keys() - _NUMBERS.keys() - _REDUNDANT)
 
-    def frame_files(self, number: int) -> list[Path]:
-        return [self.files[number]]
+    def _files(self, number: int) -> list[Path]:
+        return [self.zips[number]]
 
-    def metadata(self, number: int) -> Metadata:
+    def _metadata(self, number: int) -> Metadata:
         # The arrays have no attributes.
         return {}
 
     def opened(self, number: int) -> AbstractContextManager[_Arrays]:
         """The arrays of one frame."""
-        return _opened(self.files[number], number if self.has_frames else None)
+        return _opened(self.zips[number], number if self.has_frames else None)
 
-    def reference(self, number: int) -> Tensor:
+    def _reference(self, number: int) -> Tensor:
         with self.opened(number) as arrays:
             return _tensor(arrays.mean("reference"))
 
-    def frame(
-        self, number: int, *, reference: bool = True, noise_seed: int = 0, buffers: Collection[str] | None = None
-    ) -> Frame:
-        """Read one frame; see :meth:`mcdenoise.data.Sequence.frame`.
-
-        ``color`` is the mean over the samples, and ``variance`` the variance of this mean; features are means, too.
-        """
+    def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
+        """Read means over samples: ``color``, features, and ``variance`` of the mean that the color is."""
         sampled = self.samples > 1 and (buffers is None or "samples" in buffers)
         samples = np.empty((self.samples, 3, *self.size), np.float32) if sampled else None
         wanted = self.shapes.keys() & _IMAGES.keys() - {"color", *(() if reference else ("reference",))}
@@ -256,13 +251,22 @@ class _NoisebaseFiles(Source):
             found["samples"] = torch.from_numpy(samples)[None]
         return Frame(color=_tensor(color), **found)
 
-    def write(self, out: Path, number: int, image: Image, *, full_float: bool = False, **_: Any) -> Path:
+    def _write(
+        self,
+        out: Path,
+        number: int,
+        image: Image,
+        alpha: Image | None,
+        lights: Mapping[str, Image],
+        output_layer: str | None,
+        full_float: bool,
+    ) -> Path:
         """Write an EXR with R, G, B, named after the zip, because the arrays hold samples rather than images.
 
         If one zip holds all frames, the frame number is appended to the name. There is neither alpha nor a layer. See
         :meth:`mcdenoise.data.Sequence.write`.
         """
-        source = self.files[number]
+        source = self.zips[number]
         target = out / (f"{source.stem}_{number:04d}.exr" if self.has_frames else f"{source.stem}.exr")
         write_exr(target, image, ["R", "G", "B"], full_float=full_float)
         return target
@@ -276,7 +280,9 @@ def find_zips(given: Sequence[Path]) -> list[Path]:
     return list(given) if all(path.suffix == SUFFIX for path in given) else []
 
 
-def open_noisebase(paths: Sequence[Path], choose_numbers: Callable[[list[int]], list[int]], *, where: str) -> Source:
+def open_noisebase(
+    paths: Sequence[Path], choose_numbers: Callable[[list[int]], list[int]], *, where: str
+) -> FrameSequence:
     """Check zips, and whether the first frame's positions are projected to their pixels.
 
     Args:
@@ -289,20 +295,20 @@ def open_noisebase(paths: Sequence[Path], choose_numbers: Callable[[list[int]], 
             one.
     """
     first = _shapes(paths[0])
-    shot = _NoisebaseFiles(numbers=[], files={}, shapes=first)
+    shot = _NoisebaseFiles(numbers=[], zips={}, shapes=first)
     if shot.has_frames:
         if len(paths) > 1:
             raise InputError(f"{where}: expected one sequence, found {len(paths)}; give one of its files")
-        shot.files = dict.fromkeys(range(first["color"][0]), paths[0])
+        shot.zips = dict.fromkeys(range(first["color"][0]), paths[0])
     else:
         groups, _ = group_files(paths)
         if len(groups) != 1:
             raise InputError(
                 f"{where}: expected the frames of one sequence, found files of {len(groups)} names; give those of one"
             )
-        shot.files = groups[0].files
-    shot.numbers = choose_numbers(sorted(shot.files))
-    for path in dict.fromkeys(shot.files[number] for number in shot.numbers):
+        shot.zips = groups[0].files
+    shot.numbers = choose_numbers(sorted(shot.zips))
+    for path in dict.fromkeys(shot.zips[number] for number in shot.numbers):
         # The first one has been looked at.
         if path != paths[0] and (found := _shapes(path)) != first:
             name = next(name for name in {**first, **found} if first.get(name) != found.get(name))

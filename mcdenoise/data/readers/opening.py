@@ -182,7 +182,7 @@ def check_files(
         InputError: a buffer is missing, or has other pixels than the color.
     """
     color = shot.choice.layers["color"]
-    main = shot.part(color)
+    main = shot.part_of(color)
     for name, layer in sorted(shot.choice.layers.items()):
         missing = [number for number in shot.numbers if not shot.has(layer, number)]
         if missing and name != "reference":
@@ -190,7 +190,7 @@ def check_files(
                 f"{pattern_of(shot.groups[layer.group])}: expected buffer '{name}' for every frame, found none for "
                 f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
             )
-        part = shot.part(layer)
+        part = shot.part_of(layer)
         if part.window != main.window and (one_window or part.display != main.display):
             raise InputError(
                 f"{next(iter(shot.groups[layer.group].files.values()))}: expected '{name}' in the pixels of the color "
@@ -270,17 +270,17 @@ def _look_beside(shot: RenderedFiles) -> None:
 
 def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
     """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
-    main, number = shot.part(shot.choice.layers["color"]), shot.numbers[0]
+    main, number = shot.part_of(shot.choice.layers["color"]), shot.numbers[0]
     height, width = main.size
     files: defaultdict[Path, list[Layer]] = defaultdict(list)
     for layer in dict.fromkeys(layers):
-        if shot.part(layer).window == main.window and shot.has(layer, number):
+        if shot.part_of(layer).window == main.window and shot.has(layer, number):
             files[shot.file(layer, number)].append(layer)
     found: defaultdict[Layer, list[Image]] = defaultdict(list)
     for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int):
         for path, own in files.items():
             for layer, pixels in read_layers(path, own, slice(int(top), int(top) + _STRIP)).items():
-                part, image = shot.part(layer), pixels[:, :: max(1, width // _COLUMNS), :3].reshape(-1, 3)
+                part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3].reshape(-1, 3)
                 found[layer].append(decode(image, part.gamma) if part.display_referred else image)
     return {layer: np.concatenate(strips) for layer, strips in found.items()}
 

@@ -203,7 +203,7 @@ def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path) 
     diffuse, glossy, coat = shares(3)
     channels = as_channels({"": diffuse + glossy + coat, "DiffuseThing": diffuse, "diffuse_direct": diffuse})
     sequence = open_sequence(save(tmp_path / "a.exr", channels), lights=("all",))
-    assert sequence.lights == ["diffuse_direct"]
+    assert list(sequence.lights) == ["diffuse_direct"]
     left = (glossy + coat).sum() / (diffuse + glossy + coat).sum()
     (warning,) = [each for each in sequence.warnings if "--layers" in each]
     assert f"{left:.1%}" in warning
