@@ -1,46 +1,26 @@
-"""Copying EXR attributes that OpenEXR's Python module cannot represent.
+"""Copying EXR attributes unchanged, whatever OpenEXR's Python module makes of them.
 
-The module fails on text in Latin-1 or Shift-JIS, on a frame rate of 24/0, on an attribute of the format of another type
-than the format says, and on some types. A copy of the file holds a placeholder text of the same length for each such
-attribute, and the original bytes are put back into the written file.
+The module fails on text in Latin-1, on a frame rate of 24/0 and on many types. So it gets a copy of the file in which
+each attribute that pixels do not need is a placeholder of the same length, and the written file gets the original bytes.
 """
 
 from __future__ import annotations
 
 import mmap
-import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 _MULTI_PART = 0x1000
-# The types that the module copies, with their sizes in bytes if all values have the same.
-_COPIED = {
-    **dict.fromkeys((b"string", b"stringvector", b"floatvector", b"chlist")),
-    **dict.fromkeys((b"compression", b"lineOrder"), 1),
-    **dict.fromkeys((b"int", b"float"), 4),
-    **dict.fromkeys((b"double", b"rational", b"timecode", b"v2i", b"v2f"), 8),
-    **dict.fromkeys((b"v3i", b"v3f"), 12),
-    **dict.fromkeys((b"v2d", b"box2i", b"box2f"), 16),
-    **{b"tiledesc": 9, b"v3d": 24, b"chromaticities": 32, b"m33f": 36, b"m44f": 64, b"m33d": 72, b"m44d": 128},
+# The attributes without which a flat image cannot be read and written as it was, and their types.
+_NEEDED = {
+    **{b"channels": b"chlist", b"compression": b"compression", b"lineOrder": b"lineOrder", b"tiles": b"tiledesc"},
+    **{b"dataWindow": b"box2i", b"displayWindow": b"box2i", b"chunkCount": b"int", b"screenWindowCenter": b"v2f"},
+    **dict.fromkeys((b"pixelAspectRatio", b"screenWindowWidth", b"dwaCompressionLevel"), b"float"),
+    **dict.fromkeys((b"name", b"type"), b"string"),
 }
-# The types of attributes of the format; the module misreads others under these names.
-_OF_FORMAT = {
-    name: kind
-    for kind, names in {
-        b"box2i": b"dataWindow displayWindow originalDataWindow sensorAcquisitionRectangle",
-        b"float": b"dwaCompressionLevel pixelAspectRatio screenWindowWidth",
-        b"int": b"chunkCount",
-        b"string": b"name type",
-        b"v2f": b"adoptedNeutral cameraColorBalance screenWindowCenter sensorCenterOffset sensorOverallDimensions",
-        # Flat images, and no others are read, have none.
-        b"": b"version",
-    }.items()
-    for name in names.split()
-} | {name: name for name in (b"chromaticities", b"compression", b"envmap", b"lineOrder", b"preview")}
-_OF_FORMAT |= {b"channels": b"chlist", b"tiles": b"tiledesc"}
-_ONLY_OF_FORMAT = {b"chlist", b"compression", b"lineOrder", b"tiledesc"}
 
 
 class Record(NamedTuple):
@@ -83,65 +63,41 @@ def records(content: bytes | mmap.mmap) -> Iterator[Record]:
 
 
 @contextmanager
-def readable(source: Path, copy: Path) -> Iterator[tuple[Path, dict[tuple[int, bytes], bytes]]]:
-    """Yield a file that OpenEXR's Python module can read, and the replaced records.
+def readable(source: Path, copy: Path) -> Iterator[dict[tuple[int, bytes], bytes]]:
+    """Write a copy that OpenEXR's Python module can read, for as long as the block lasts.
 
     Args:
         source: an EXR.
-        copy: path for a temporary copy.
+        copy: path of the copy.
 
     Yields:
-        ``source`` itself and nothing, or ``copy`` and the original records by part and name.
+        The original records by part and name of the placeholder, for :func:`put_back`.
     """
-    unreadable: dict[tuple[int, bytes], bytes] = {}
-    with source.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        found = [each for each in records(content) if _is_unreadable(each, content)]
-        if found:
-            pixels = bytearray(content)
-            for part, name, _, start, _, end in found:
-                # A name of the format must not have a text.
-                name = b"~" + name[1:] if name in _OF_FORMAT else name
-                unreadable[part, name] = content[start:end]
-                rest = end - start - len(name) - len(b"\0string\0....")
-                if rest < 0:
-                    raise ValueError("damaged header")
-                text = name + b"\0string\0" + rest.to_bytes(4, "little") + b"." * rest
-                pixels[start:end] = text
-    if not unreadable:
-        yield source, unreadable
-        return
+    originals: dict[tuple[int, bytes], bytes] = {}
     try:
-        copy.write_bytes(pixels)
-        del pixels
-        yield copy, unreadable
+        shutil.copyfile(source, copy)
+        with copy.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
+            for each in list(records(content)):
+                # As long as the name was: a file says that it has long ones.
+                name = (b"~%d" % len(originals)).ljust(len(each.name), b"~")
+                text = name + b"\0string\0"
+                rest = each.end - each.start - len(text) - 4
+                if rest >= 0 and not _is_needed(each, content):
+                    originals[each.part, name] = content[each.start : each.end]
+                    content[each.start : each.end] = text + rest.to_bytes(4, "little") + b"." * rest
+        yield originals
     finally:
-        with suppress(OSError):
-            os.unlink(copy)
+        copy.unlink(missing_ok=True)
 
 
-def put_back(target: Path, unreadable: dict[tuple[int, bytes], bytes]) -> None:
+def put_back(target: Path, originals: dict[tuple[int, bytes], bytes]) -> None:
     """Replace placeholder records by the original ones."""
     with target.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
-        for part, name, _, start, _, end in list(records(content)):
-            record = unreadable.get((part, name))
-            if record is not None and len(record) == end - start:
-                content[start:end] = record
+        for each in list(records(content)):
+            content[each.start : each.end] = originals.get((each.part, each.name), content[each.start : each.end])
 
 
-def _is_unreadable(record: Record, content: mmap.mmap) -> bool:
-    name, kind, value = record.name, record.kind, content[record.value : record.end]
-    if (
-        kind not in _COPIED
-        or _OF_FORMAT.get(name, kind) != kind
-        or (kind in _ONLY_OF_FORMAT and name not in _OF_FORMAT)
-    ):
-        return True
-    if len(value) != (_COPIED[kind] or len(value)):
-        return True
-    if kind == b"rational":
-        return not any(value[4:])
-    try:
-        value.decode() if b"string" in kind else b""
-    except UnicodeDecodeError:
-        return True
-    return b"vector" in kind and len(value) <= 4
+def _is_needed(record: Record, content: mmap.mmap) -> bool:
+    value = content[record.value : record.end]
+    is_text = record.kind != b"string" or value.decode(errors="replace").encode() == value
+    return _NEEDED.get(record.name) == record.kind and is_text

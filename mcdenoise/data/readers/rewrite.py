@@ -77,8 +77,9 @@ def _write_exr(
         expected = read_image_header(source).parts
         # The library skips unreadable parts with a printed warning. Suppressing that would also suppress the output of
         # all other threads.
-        with readable(source, target.with_suffix(".copy.exr")) as (path, unreadable):
-            file = OpenEXR.File(str(path), separate_channels=True)
+        copy = target.with_suffix(".copy.exr")
+        with readable(source, copy) as originals:
+            file = OpenEXR.File(str(copy), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except Exception as error:
         return f"{source} cannot be read again: {_first_line(error)}"
@@ -105,8 +106,7 @@ def _write_exr(
         )
     try:
         file.write(str(target))
-        if unreadable:
-            put_back(target, unreadable)
+        put_back(target, originals)
         written = read_image_header(target).parts
         # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
         for index, each in enumerate(written):
