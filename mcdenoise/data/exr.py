@@ -20,6 +20,8 @@ from mcdenoise.data.images import (
     MetadataValue,
     check_name,
     pending_error,
+    read_channels,
+    read_image_header,
     read_picture,
 )
 from mcdenoise.errors import InputError
@@ -31,10 +33,12 @@ __all__ = [
     "Mask",
     "Metadata",
     "MetadataValue",
+    "cannot_write",
     "pending_error",
     "read_exr",
     "within_half",
     "write_exr",
+    "write_image",
 ]
 
 LARGEST_HALF = 65504.0
@@ -98,10 +102,7 @@ def write_exr(
         if not name.startswith(STORAGE_PREFIXES):
             _set_attribute(spec, name, value)
     spec.attribute("compression", "zip")
-    with atomic_path(path) as temporary:
-        reason = _write(temporary, spec, image, full_float).replace(str(temporary), path.name)
-        if reason:
-            raise InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
+    write_image(path, spec, image)
 
 
 def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> None:
@@ -111,30 +112,50 @@ def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> Non
         spec.attribute(name, value)
 
 
-def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any], full_float: bool) -> str:
+def write_image(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> None:
+    """Write a file of one image atomically, in the format that its name says.
+
+    Not by ImageBuf, which leaves an entry per file in OpenImageIO's cache and fragments the heap.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        if reason := _write(temporary, spec, image).replace(str(temporary), path.name):
+            raise cannot_write(path, reason)
+
+
+def cannot_write(path: Path, reason: str) -> InputError:
+    """The error of a file that cannot be written."""
+    return InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
+
+
+def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> str:
     """Write the file; return the reason of a failure, or an empty text."""
-    file = oiio.ImageOutput.create("openexr")
-    if file is None:
-        return pending_error(oiio)
-    if not file.open(str(path), spec):
-        return pending_error(file)
-    written = True
-    for top in range(0, spec.height, _ROWS):
-        pixels = np.ascontiguousarray(image[top : top + _ROWS], dtype=np.float32)
-        if not full_float:
-            pixels = within_half(pixels)
-        written = written and file.write_scanlines(top, top + len(pixels), 0, pixels)
+    file = oiio.ImageOutput.create(str(path))
+    if file is None or not file.open(str(path), spec):
+        return pending_error(file or oiio) or "writing failed"
+    if file.format_name() == "openexr":
+        tops = range(0, spec.height, _ROWS)
+        strips = (np.asarray(image[top : top + _ROWS], np.float32) for top in tops)
+        half = spec.format == oiio.HALF
+        written = all(
+            file.write_scanlines(top, top + len(strip), 0, np.ascontiguousarray(within_half(strip) if half else strip))
+            for top, strip in zip(tops, strips, strict=True)
+        )
+    else:
+        written = file.write_image(np.ascontiguousarray(image))
     reason = pending_error(file)
     if not file.close() or not written:
         return reason or "writing failed"
-    # OpenImageIO does not report a full disk for the last few kilobytes, so read them back.
-    check = oiio.ImageInput.open(str(path))
-    if check is None:
-        return f"incomplete: {pending_error(oiio)}"
-    last = check.read_scanlines(0, 0, spec.height - 1, spec.height, 0, 0, spec.nchannels, oiio.FLOAT)
-    reason = pending_error(check)
-    check.close()
-    return "" if last is not None and not reason else f"incomplete: {reason}"
+    # OpenImageIO does not report a full disk for the last few kilobytes, so read them back. A PNG has checksums.
+    try:
+        header = read_image_header(path)
+        if header.format != "png":
+            read_channels(path, {0: header.parts[0].channels}, slice(-1, None))
+    except InputError as error:
+        return f"incomplete: {error}"
+    return ""
 
 
 def within_half(pixels: NDArray[Any]) -> NDArray[Any]:

@@ -1,7 +1,7 @@
 """Copying EXR attributes unchanged, whatever OpenEXR's Python module makes of them.
 
 The module fails on text in Latin-1, on a frame rate of 24/0 and on many types. So it gets a copy of the file in which
-each attribute that pixels do not need is a placeholder of the same length, and the written file gets the original bytes.
+each attribute that pixels do not need is a placeholder of the same length; the written file gets the original.
 """
 
 from __future__ import annotations

@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import OpenEXR
-import OpenImageIO as oiio
 
-from mcdenoise.data.exr import LARGEST_HALF, Image, pending_error, within_half
+from mcdenoise.data.exr import LARGEST_HALF, Image, cannot_write, within_half, write_image
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
 from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
-from mcdenoise.errors import InputError
 
 # Names of the channels that DWA compression rounds, and its usual level.
 _DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45
@@ -39,28 +37,21 @@ def write_like(
         source: an existing image file.
         target: the file to write, atomically. Its folder must exist.
         replaced: ``(H, W)`` pixels by part and channel.
-        added: ``(H, W)`` pixels of new channels, by name.
+        added: ``(H, W)`` pixels of new channels of an EXR, by name.
         part: the part that gets the new channels.
         like: the channel of that part whose type the new channels get.
         full_float: store all these channels as 32-bit floats, whatever the types were.
         stored: the curve of a picture that is no EXR; by default what the file says.
 
     Raises:
-        InputError: the file cannot be written, or a layer is to be added to a file that has none.
+        InputError: the file cannot be written.
     """
+    if FORMATS.get(source.suffix.lower()) != "openexr":
+        _write_picture(source, target, {name: image for (_, name), image in replaced.items()}, stored)
+        return
     with atomic_path(target) as temporary:
-        if FORMATS.get(source.suffix.lower()) == "openexr":
-            reason = _write_exr(source, temporary, replaced, added, part, like, full_float)
-        elif added:
-            raise InputError(
-                f"{source}: expected an EXR to add a layer to, found '{source.suffix}'; replace its picture"
-            )
-        else:
-            reason = _write_picture(source, temporary, {name: image for (_, name), image in replaced.items()}, stored)
-        if reason:
-            raise InputError(
-                f"{target}: cannot be written ({reason}); check the folder, its permissions and free space"
-            )
+        if reason := _write_exr(source, temporary, replaced, added, part, like, full_float):
+            raise cannot_write(target, reason)
 
 
 def _write_exr(
@@ -152,7 +143,7 @@ def _stored(image: Image, kind: Any) -> Any:
     return np.ascontiguousarray(within_half(image) if kind == np.float16 else image, dtype=kind)
 
 
-def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> str:
+def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> None:
     """Write a file with one picture, with its other channels and its pixel type unchanged."""
     spec, header, pixels = read_picture(source)
     stored = stored or header.parts[0]
@@ -161,15 +152,4 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], st
             image = replaced[name]
             display = stored.display_referred and name.lower() not in ("a", "alpha")
             pixels[..., place] = encode(image[..., None], stored.gamma)[..., 0] if display else image
-    output = oiio.ImageOutput.create(str(target))
-    if output is None or not output.open(str(target), spec):
-        return pending_error(output or oiio) or "writing failed"
-    written = output.write_image(pixels)
-    if not output.close() or not written:
-        return pending_error(output) or "writing failed"
-    # A full disk is not reported, so read the pixels back.
-    try:
-        read_picture(target)
-    except InputError as error:
-        return f"incomplete: {error}"
-    return ""
+    write_image(target, spec, pixels)
