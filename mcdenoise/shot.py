@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Sequential
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -134,11 +134,11 @@ class ShotSettings:
         """Whether a measurement chooses the model."""
         return self.budget_ms is not None or self.max_error is not None
 
-    def open(self, inputs: Sequential[Path]) -> Sequence:
+    def open(self, inputs: Sequential[Path] | Mapping[str, Path]) -> Sequence:
         """Open the frames.
 
         Args:
-            inputs: folders, files or patterns.
+            inputs: folders, files or patterns; or the file of each buffer of one frame.
 
         Raises:
             InputError: see :func:`mcdenoise.data.open_sequence`; or the frames lack a requested buffer.

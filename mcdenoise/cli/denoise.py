@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
+from collections.abc import Sequence as Sequential
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,8 +18,11 @@ from mcdenoise.cli._options import Inputs, Json, Out
 from mcdenoise.cli._output import print_times, progress_bar, say, stages, warn, write_json
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
-from mcdenoise.data import Sequence
-from mcdenoise.folder import denoise_sequence, prepare_folder
+from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.images import FORMATS
+from mcdenoise.data.radiance import write_radiance
+from mcdenoise.errors import InputError
+from mcdenoise.folder import denoise_sequence, make_folder, prepare_folder
 from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import pretrained_models
@@ -29,17 +36,22 @@ def denoise(
     inputs: Inputs,
     out: Out,
     shot: tyro.conf.OmitArgPrefixes[ShotOptions],
+    albedo: Path | None = None,
+    normal: Path | None = None,
     json: Json = None,
 ) -> None:
-    """Denoise the frames of a shot; writes denoised copies of the files to OUT, and OUT/denoise.json.
+    """Denoise a frame to a file, or the frames of a shot to a folder.
 
     Args:
         inputs: a folder; files; or a pattern such as 'shot_####.exr', 'shot_%04d.exr' or 'shot_*.exr'. Each frame may
             be an EXR with layers, or one file per buffer; `mcdenoise inspect` shows which layer each buffer is read
             from.
-        out: folder to write to: files of the same names, with denoised radiance and all other layers unchanged
-            (for the BMFR layout: denoisedN.exr).
+        out: for one frame, a file such as clean.exr, .pfm, .hdr, .tif or .png: a copy of the input with denoised
+            radiance, or the radiance alone in another format. Or a folder to write to: files of the same names, with
+            denoised radiance and all other layers unchanged (for the BMFR layout: denoisedN.exr), and denoise.json.
         shot: options for reading, denoising and writing the shot.
+        albedo: file of the albedo of a single frame, if it is not a layer of the input.
+        normal: likewise, of the normals.
         json: write the run times to this file too.
     """
     shot.check()
@@ -47,8 +59,40 @@ def denoise(
     (keep_heap if shot.max_memory is None else return_heap)()
     if shot.threads is not None:
         torch.set_num_threads(shot.threads)
-    opened = shot.open(inputs)
-    shown = shot.preview_in(out, video=len(opened) > 1) if shot.preview else None
+    opened = shot.open(_by_buffer(inputs, albedo, normal))
+    if out.suffix.lower() not in FORMATS or out.is_dir():
+        _denoise(opened, out, shot, json)
+        return
+    if len(opened) > 1 or shot.preview:
+        found = f"{len(opened)} frames" if len(opened) > 1 else "--preview"
+        raise InputError(f"{out}: expected a single frame for a file, and no preview, found {found}; name a folder")
+    if any(os.path.realpath(out) == os.path.realpath(each) for each in (*inputs, albedo, normal) if each):
+        raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
+    make_folder(out.parent)
+    with tempfile.TemporaryDirectory(prefix=".denoised-", dir=out.parent) as folder:
+        written = _denoise(opened, Path(folder), shot, json, shown=out)
+        if FORMATS.get(written.suffix.lower()) == FORMATS[out.suffix.lower()]:
+            written.replace(out)
+        else:
+            result = open_sequence([written])
+            write_radiance(out, result.frame(result.numbers[0]).color[0].permute(1, 2, 0).numpy())
+
+
+def _by_buffer(
+    inputs: tuple[Path, ...], albedo: Path | None, normal: Path | None
+) -> Sequential[Path] | dict[str, Path]:
+    """The file of each buffer, where the options name them."""
+    features = {name: path for name, path in (("albedo", albedo), ("normal", normal)) if path is not None}
+    if not features:
+        return inputs
+    if len(inputs) != 1:
+        raise InputError(f"--{next(iter(features))}: expected one file of noisy radiance, found {len(inputs)} inputs")
+    return {"color": inputs[0], **features}
+
+
+def _denoise(opened: Sequence, out: Path, shot: ShotSettings, json: Path | None, shown: Path | None = None) -> Path:
+    """Denoise a shot to a folder, and print the report; returns the last file, which is called ``shown`` there."""
+    preview = shot.preview_in(out, video=len(opened) > 1) if shot.preview else None
     if shot.is_budgeted:
         with progress_bar() as progress:
             task = progress.add_task("measure models", total=None)
@@ -76,12 +120,12 @@ def denoise(
             output_layer=shot.output_layer,
             picked=choice,
             on_frame=lambda: progress.advance(task),
-            on_written=shown.add if shown else None,
+            on_written=preview.add if preview else None,
         )
         taken = time.perf_counter() - began
-        if shown:
+        if preview:
             task = progress.add_task("preview", total=len(opened))
-            shown.close(on_frame=lambda: progress.advance(task))
+            preview.close(on_frame=lambda: progress.advance(task))
     for row in report.plan:
         say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.clamped:
@@ -106,9 +150,10 @@ def denoise(
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})
-    if shown:
-        say(f"preview: {shown.written[-1]}")
-    say(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {out / names}")
+    if preview:
+        say(f"preview: {preview.written[-1]}")
+    say(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} in {taken:.1f} s: {shown or out / names}")
+    return files[-1]
 
 
 def _backend(opened: Sequence, shot: ShotSettings) -> AbstractContextManager[None]:

@@ -26,12 +26,12 @@ def evaluate(
     device: str = "cpu",
     json: Json = None,
 ) -> None:
-    """Compare denoised images, from a folder or from a model, with the references of a sequence.
+    """Compare denoised images, or those of a model, with references: two files, two folders, or those of a sequence.
 
     Args:
-        sequence: folder of a sequence with references.
-        images: folder with one EXR per frame, such as denoised12.exr or frame.0012.exr, scene-linear RGB, written by
-            any denoiser.
+        sequence: the reference: an image, or a folder or pattern of images; or a folder of a sequence with references.
+        images: the denoised image, or a folder with one EXR per frame, such as denoised12.exr or frame.0012.exr,
+            scene-linear RGB, written by any denoiser.
         model: evaluate this model instead: a name with optional settings, a weights file, or file.py:factory, as for
             `mcdenoise denoise`.
         protocol: protocol of a publication, whose numbers are printed in addition to the strict ones.
@@ -47,6 +47,9 @@ def evaluate(
             "add --model NAME to denoise and compare"
         )
     opened = open_sequence(sequence, frames)
+    if images is not None and not opened.reference_numbers:
+        opened = open_sequence({"color": sequence, "reference": sequence}, frames)
+        say(f"{sequence} has no references, and is taken as the reference")
     spelling = None if model is None else parse_method(model)
     total = len(opened.reference_numbers if spelling is None else opened.numbers)
     with progress_bar() as progress:

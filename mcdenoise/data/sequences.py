@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Sequential
 from dataclasses import replace
 from itertools import pairwise
@@ -11,7 +12,7 @@ from pathlib import Path
 from mcdenoise.data.images import FORMATS
 from mcdenoise.data.readers.bmfr import find_bmfr, open_bmfr
 from mcdenoise.data.readers.choice import parse_mapping
-from mcdenoise.data.readers.names import FileGroup, find_files, group_files
+from mcdenoise.data.readers.names import FileGroup, find_files, group_files, with_stills
 from mcdenoise.data.readers.noisebase import find_zips, open_noisebase
 from mcdenoise.data.readers.opening import ColorSpace, open_files
 from mcdenoise.data.readers.sequence import Sequence, any_values, summary
@@ -22,7 +23,7 @@ _LARGEST_FRAME_COUNT = 1_000_000
 
 @any_values
 def open_sequence(
-    path: Path | Sequential[Path],
+    path: Path | Sequential[Path] | Mapping[str, Path],
     frames: str | None = None,
     *,
     mapping: Sequential[str] = (),
@@ -34,7 +35,8 @@ def open_sequence(
 
     Args:
         path: a folder, or a folder that contains it as ``inputs``; a file; a pattern such as ``shot_####.exr``; or
-            several of these. For Noisebase: the zip of a sequence, the zips of its frames, or a folder of zips.
+            several of these; or one for each buffer, by buffer. For Noisebase: the zip of a sequence, the zips of its
+            frames, or a folder of zips.
         frames: frames to use, such as ``"0-59,70"``; all by default.
         mapping: layers by buffer if names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
@@ -46,7 +48,8 @@ def open_sequence(
         InputError: nothing was found, the files cannot be recognised, a frame or buffer is missing, or files do not
             match one another.
     """
-    given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    by_buffer = path if isinstance(path, Mapping) else {}
+    given = _given(path.values() if isinstance(path, Mapping) else path)
     if not given:
         raise InputError("input: expected a folder, a file or a pattern, found nothing")
     gaps: list[str] = []
@@ -56,21 +59,28 @@ def open_sequence(
         return _choose(given[0], present, frames)
 
     where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
-    bmfr = find_bmfr(given)
+    bmfr = None if by_buffer else find_bmfr(given)
     sequence: Sequence
     if bmfr is not None and not mapping and not lights:
         sequence, layout = open_bmfr(*bmfr, chosen, color_has_albedo), "bmfr"
-    elif zips := find_zips(given):
+    elif not by_buffer and (zips := find_zips(given)):
         if mapping or lights:
             raise InputError(f"{where}: expected neither --map nor --layers, found one: these arrays have their names")
         sequence, layout = open_noisebase(zips, chosen, where=where), "noisebase"
     else:
         groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
+        if by_buffer:
+            own = ((name, _groups([each], where)[0]) for name, each in zip(by_buffer, given, strict=True))
+            groups = with_stills([replace(group, label=name) for name, found in own for group in found])
         named = parse_mapping(mapping)
         sequence = open_files(groups, chosen, where, named, color_has_albedo, lights, color_space)
     place = given[0].resolve()
     name = place.parent.name if place.name == "inputs" else place.name
     return replace(sequence, root=given[0], name=name, layout=layout, warnings=[*gaps, *sequence.warnings])
+
+
+def _given(path: Path | Iterable[Path]) -> list[Path]:
+    return [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
 
 
 def _groups(given: Sequential[Path], where: str) -> tuple[list[FileGroup], str]:
@@ -97,7 +107,7 @@ def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> l
     Raises:
         InputError: nothing was found, or ``frames`` is invalid.
     """
-    given = [Path(path)] if isinstance(path, str | Path) else [Path(each) for each in path]
+    given = _given(path)
     if (bmfr := find_bmfr(given)) is not None:
         numbers = set(bmfr[1]["color"])
     elif find_zips(given):

@@ -131,20 +131,22 @@ def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
-    """Find the EXR file of each frame, by the number in its name.
+    """Find the EXR file of each frame, by the number in its name; or the one file of one frame.
 
     If the folder has files ``denoisedN.exr``, only these are used. Otherwise the names of all its EXR files must differ
     in one number only, such as ``frame.0012.exr`` or ``shot02_0012.exr``; other numbers in the names must be constant.
 
     Args:
-        folder: folder of the images.
+        folder: folder of the images; for one frame, its image.
         numbers: required frames.
 
     Raises:
         InputError: there is no such folder, the names do not give frame numbers, or a frame is missing.
     """
+    if os.path.isfile(folder) and len(numbers) == 1:
+        return dict.fromkeys(numbers, folder)
     if not os.path.isdir(folder):
-        found = "a file" if os.path.isfile(folder) else "no such folder"
+        found = f"a file for {len(numbers)} frames" if os.path.isfile(folder) else "no such folder"
         raise InputError(f"{folder}: expected a folder of denoised EXR images, found {found}; check the path")
     stems = [path.stem for path in sorted(folder.glob("*.exr")) if not path.name.startswith(".")]
     if not stems:

@@ -163,7 +163,8 @@ WAYS = {
 EXACT = ("asvgf", "bmfr", "svgf")
 # Their images depend on all pixels.
 WHOLE = ("accumulated", "anf", "asvgf", "bmfr", "noisy", "nppd", "rae", "svgf")
-# The members of a family differ by their sizes. One of each kind is tested in all ways by the tests that are not slow.
+# The members of a family differ by their sizes: the tests that are not slow are of the smallest one, and one method of
+# each kind is tested in all ways.
 FAMILIES = ("cascaded_v2*", "cascaded_v3*", "oidn_tuned*")
 SMALLEST = ("cascaded_v2_micro", "cascaded_v3_micro", "oidn_tuned_small")
 KINDS = (*SMALLEST, "accumulated", "joint_bilateral", "kpcn", "rae", "sbmc", "svgf")
@@ -188,7 +189,7 @@ def is_slow(method: str, way: str) -> bool:
     large = method not in SMALLEST and any(fnmatch(method, family) for family in FAMILIES)
     if WAYS[way].shot is STILL:
         return way != "skipped" or method != "cascaded_v2_micro"
-    return way != "whole" and method not in KINDS and (large or way != "gradients")
+    return large or (way not in ("whole", "gradients") and method not in KINDS)
 
 
 def precision_of(method: str, way: str) -> str:

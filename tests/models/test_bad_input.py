@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_models import MODELS, SIZES, TRAINABLE, WIDTH, tensors
+from test_models import KINDS, SIZES, TRAINABLE, WIDTH, tensors
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 from toys import refused, small, whole_frame
@@ -57,8 +57,8 @@ def shape_of(state: Any) -> Any:
 
 
 # Named, since to run every method while tests are collected would take a minute.
-KEEPING = [name for name in MODELS if name not in ("noisy", "oidn", "oidn_open")]
-DEMANDING = [name for name in MODELS if model_of(name).needs.buffers != {"color"}]
+KEEPING = [name for name in KINDS if name not in ("noisy", "oidn", "oidn_open")]
+DEMANDING = [name for name in KINDS if model_of(name).needs.buffers != {"color"}]
 
 
 # Buffers
@@ -110,7 +110,7 @@ def test_a_function_of_buffers_says_which_it_takes() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 def test_buffers_of_use_come_and_go_within_a_shot(name: str) -> None:
     model = model_of(name)
     whole, denoiser = whole_frame(model, HEIGHT, WIDE), Denoiser(model)
@@ -139,12 +139,12 @@ def test_an_accumulated_buffer_that_comes_or_goes_begins_a_new_shot() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 def test_a_state_of_another_method_is_refused(name: str) -> None:
     """A state of the same parts, such as the accumulated radiance, is accepted; a method without a state reads none."""
     model, own = model_of(name), state_of(name)
     frame = whole_frame(model, HEIGHT, WIDE, seed=5)
-    for other in MODELS:
+    for other in KINDS:
         state = state_of(other)
         if state is None or shape_of(state) == shape_of(own):
             assert torch.isfinite(model(frame, state)[0].image).all()
@@ -284,5 +284,5 @@ def test_a_network_without_weights_says_which_have_them() -> None:
 
 
 def test_states_are_of_tensors_that_these_tests_look_at() -> None:
-    assert [name for name in MODELS if state_of(name) is not None] == KEEPING
+    assert [name for name in KINDS if state_of(name) is not None] == KEEPING
     assert all(tensors(state_of(name)) for name in KEEPING)

@@ -18,7 +18,7 @@ import torch
 from reads import without_reads
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
-from toys import Same, refused, small, whole_frame
+from toys import Same, one_of_each, refused, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
 from mcdenoise.models import Accumulated, Demodulated, FrameReport, Output, _report, _times, list_models
@@ -27,7 +27,7 @@ from mcdenoise.models._times import Times
 
 # Open Image Denoise is a library for processors here: images go there and back, which waits.
 ON_THE_HOST = {"oidn", "oidn_temporal"}
-MODELS = [name for name in list_models() if name not in ON_THE_HOST]
+MODELS = [name for name in one_of_each(list_models()) if name not in ON_THE_HOST]
 SIZE = (40, 56)
 
 READS = {

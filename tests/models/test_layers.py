@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from toys import Same, frame_of, refused, small, still, whole_frame
+from toys import Same, frame_of, one_of_each, refused, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import Accumulated, Demodulated, Exposed, FrameReport, Needs, Output, Skipping, Tiled, list_models
@@ -27,7 +27,7 @@ MODELS = [
             name in OIDN and importlib.util.find_spec("pyoidn") is None, reason="it is in the extra mcdenoise[oidn]"
         ),
     )
-    for name in list_models()
+    for name in one_of_each(list_models())
 ]
 # For the other methods the library decides on derivatives, or there are none.
 DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]

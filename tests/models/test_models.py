@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import refused, small, whole_frame
+from toys import one_of_each, refused, small, whole_frame
 
 from mcdenoise import Frame
 from mcdenoise.frame import RADIANCE, Hints, scale_samples
@@ -44,6 +44,7 @@ from mcdenoise.models import (
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8
 MODELS = list_models()
+KINDS = one_of_each(MODELS)
 DIFFERENTIABLE: dict[str, dict[str, Any]] = {"oidn_temporal": {"engine": "torch"}}
 FAMILY = ["cascaded_v2", "cascaded_v2_micro", "cascaded_v2_small", "cascaded_v2_tiny"]
 SIZES = [(1, 1), (5, 7), (17, 33)]
@@ -53,7 +54,7 @@ def trainable(name: str) -> bool:
     return bool(find_model(name).construct) and create_model(name).needs.trainable
 
 
-TRAINABLE = [name for name in MODELS if trainable(name)]
+TRAINABLE = [name for name in KINDS if trainable(name)]
 
 
 def tensors(tree: Any) -> list[Tensor]:
@@ -99,7 +100,7 @@ def test_images_of_any_size(name: str, size: tuple[int, int]) -> None:
         assert (output.image >= 0).all()
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_a_step_is_a_pure_function(name: str) -> None:
     """The same frame and state give the same image and state, and are not changed."""
@@ -119,7 +120,7 @@ def test_a_step_is_a_pure_function(name: str) -> None:
 
 
 @pytest.mark.parametrize("batch", [1, 2])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_a_state_is_of_tensors_with_the_batch_first_and_of_one_structure(name: str, batch: int) -> None:
     """The frames move, then stand still, and then there is a cut."""
@@ -139,7 +140,7 @@ def test_a_state_is_of_tensors_with_the_batch_first_and_of_one_structure(name: s
             assert None in [None if one is None else 0 for one in pair] or pair[0].dim() == pair[1].dim(), path
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_images_of_a_batch_do_not_see_each_other(name: str) -> None:
     model = small(name)
@@ -159,7 +160,7 @@ def test_images_of_a_batch_do_not_see_each_other(name: str) -> None:
         torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_hints_change_no_image(name: str) -> None:
     """They change none by more than the tolerance, and that of a single frame not at all."""
@@ -171,7 +172,7 @@ def test_hints_change_no_image(name: str) -> None:
         torch.testing.assert_close(output.image, expected.image, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_the_declared_needs_suffice(name: str) -> None:
     """All or any of the buffers that are only useful may be missing."""
@@ -192,7 +193,7 @@ def test_the_declared_needs_suffice(name: str) -> None:
 
 @pytest.mark.parametrize("bare", [False, True], ids=["", "bare"])
 @pytest.mark.parametrize("factor", [2.0**-20, 1e-1, 2.0**20])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_exposure_only_scales_the_result(name: str, factor: float, bare: bool) -> None:
     """Of a first and a second frame, with all features and without those that are only useful."""
@@ -258,7 +259,7 @@ def hostile(model: Any, number: int) -> Frame:
     return frame.replace(**{name: changed(name, getattr(frame, name)) for name in given})
 
 
-@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn"}))
+@pytest.mark.parametrize("name", sorted(set(KINDS) - {"oidn"}))
 def test_gradients_of_hostile_frames_are_finite(name: str) -> None:
     """In all buffers of four frames, the last of which is black, and in all weights."""
     model, state, loss = small(name, **DIFFERENTIABLE.get(name, {})), None, torch.zeros(())
@@ -314,7 +315,7 @@ def even(height: int, width: int, model: Any) -> Frame:
     return frame.replace(**given)
 
 
-@pytest.mark.parametrize("name", sorted(set(MODELS) - {"oidn"}))
+@pytest.mark.parametrize("name", sorted(set(KINDS) - {"oidn"}))
 @torch.no_grad()
 def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
     """Up to its borders: it varies by little more than far from them, and has the level that it has there."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import pytest
@@ -95,6 +95,11 @@ def whole_frame(model: Model, height: int, width: int, batch: int = 1, seed: int
         image = torch.rand(batch, *samples, channels, height, width, generator=generator)
         (given if name in BUFFERS or name == "samples" else extra)[name] = 1 + image if name == "length" else image
     return Frame(color, **given, extra=extra)
+
+
+def one_of_each(names: Iterable[str]) -> list[str]:
+    """One name for each constructor: the sizes of a method differ in their settings only."""
+    return list({find_model(name).construct: name for name in sorted(names, reverse=True)}.values())[::-1]
 
 
 def small(name: str, **settings: Any) -> Any:

@@ -126,7 +126,7 @@ def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
     groups: list[FileGroup] = []
     for (_, texts, _), members in alike.items():
         groups += _split_by_number(texts, members)
-    return _with_stills(groups), "files"
+    return with_stills(groups), "files"
 
 
 def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]]]) -> list[FileGroup]:
@@ -152,7 +152,7 @@ def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]
     return [FileGroup("".join(words).strip(" ._-"), dict(sorted(files.items())))]
 
 
-def _with_stills(groups: list[FileGroup]) -> list[FileGroup]:
+def with_stills(groups: list[FileGroup]) -> list[FileGroup]:
     """Add stills with other numbering: `albedo.exr` beside `render_0007.exr` belongs to that frame."""
     if len(groups) > 1 and all(len(group.files) == 1 for group in groups):
         numbers = {number for group in groups for number in group.files} - {0}

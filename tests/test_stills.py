@@ -1,0 +1,102 @@
+"""Single images on the command line: a file in, a file out in any format; and an image compared with a reference."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import refuses, succeeds
+from numpy.typing import NDArray
+
+from mcdenoise import denoise
+from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.radiance import write_radiance
+
+SIZE = (24, 32)
+# Largest relative error of a format's numbers, and the largest one beside it; half floats have 11 bits, RGBE 8.
+ERRORS = {".exr": (2**-11, 0.0), ".pfm": (1e-6, 0.0), ".hdr": (0.0, 2**-7), ".tif": (0.0, 1e-4), ".png": (0.0, 5e-3)}
+
+
+def read(path: Path) -> NDArray[Any]:
+    opened = open_sequence(path)
+    return opened.frame(opened.numbers[0]).color[0].permute(1, 2, 0).numpy()
+
+
+@pytest.fixture
+def buffers(tmp_path: Path) -> dict[str, NDArray[Any]]:
+    """Buffers in files of names that tell nothing."""
+    rng = np.random.default_rng(0)
+    albedo = np.where(np.arange(SIZE[1]) < 16, 0.2, 0.8)[None, :, None] * np.ones((*SIZE, 3))
+    normal = np.broadcast_to(np.float32([0.6, 0, -0.8]), (*SIZE, 3))
+    found = {"x": 0.9 * albedo * rng.random((*SIZE, 3)), "y": albedo, "z": normal}
+    found = {name: np.ascontiguousarray(image, np.float32) for name, image in found.items()}
+    for name, image in found.items():
+        write_radiance(tmp_path / f"{name}.pfm", image)
+    return found
+
+
+@pytest.mark.parametrize("ending", ERRORS)
+def test_a_file_is_denoised_to_a_file_of_any_format(
+    ending: str, buffers: dict[str, NDArray[Any]], tmp_path: Path
+) -> None:
+    out = tmp_path / "new" / f"clean{ending}"
+    features = ["--albedo", tmp_path / "y.pfm", "--normal", tmp_path / "z.pfm"]
+    succeeds("denoise", tmp_path / "x.pfm", *features, "--model", "joint_bilateral", "-o", out)
+    assert [each.name for each in out.parent.iterdir()] == [out.name]
+    expected = denoise(buffers["x"], albedo=buffers["y"], normal=buffers["z"], model="joint_bilateral")
+    relative, absolute = ERRORS[ending]
+    np.testing.assert_allclose(read(out), expected, rtol=relative, atol=absolute)
+
+
+def test_the_layers_of_a_file_are_kept(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    noisy, out = tmp_path / "noisy.exr", tmp_path / "clean.exr"
+    names = [*"RGB", *("albedo.R", "albedo.G", "albedo.B")]
+    write_exr(noisy, np.concatenate([buffers["x"], buffers["y"]], 2), names, full_float=True)
+    succeeds("denoise", noisy, "--model", "joint_bilateral", "-o", out)
+    pixels, channels, _ = read_exr(out)
+    found = {name: pixels[..., channels.index(name)] for name in names}
+    np.testing.assert_array_equal(found["albedo.G"], buffers["y"][..., 1])
+    expected = denoise(buffers["x"], albedo=buffers["y"], model="joint_bilateral")
+    np.testing.assert_allclose(found["G"], expected[..., 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("x.pfm", "-o", "x.pfm"), "found the same"),
+        (("x.pfm", "--albedo", "y.pfm", "-o", "y.pfm"), "found the same"),
+        (("x.pfm", "z.pfm", "--albedo", "y.pfm", "-o", "out.pfm"), "found 2 inputs"),
+        (("x.pfm", "--albedo", "none.pfm", "-o", "out.pfm"), "none.pfm"),
+        (("x.pfm", "--preview", "-o", "out.pfm"), "found --preview"),
+        (("shot_#.pfm", "-o", "out.pfm"), "found 2 frames"),
+    ],
+)
+def test_what_cannot_be_one_file_is_refused(
+    arguments: tuple[str, ...],
+    expected: str,
+    buffers: dict[str, NDArray[Any]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for number in (1, 2):
+        write_radiance(Path(f"shot_{number}.pfm"), buffers["x"])
+    assert expected in refuses("denoise", *arguments, "--model", "noisy")
+    assert not Path("out.pfm").exists()
+    np.testing.assert_array_equal(read(Path("x.pfm")), buffers["x"])
+
+
+def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    for folder, image in (("a", buffers["y"]), ("b", buffers["y"] + 0.1)):
+        (tmp_path / folder).mkdir()
+        for number in (1, 2):
+            write_radiance(tmp_path / folder / f"{folder}{number}.exr", image)
+    # Means of |a - b| / (|a| + |b| + 0.01) over both halves of the image.
+    smape, file = (0.1 / 0.51 + 0.1 / 1.71) / 2, tmp_path / "errors.json"
+    for where in ("a", "b"), ("a/a1.exr", "b/b2.exr"):
+        succeeds("evaluate", *(tmp_path / each for each in where), "--json", file)
+        strict = json.loads(file.read_text())["protocols"]["strict"]
+        assert strict["mean"]["SMAPE"] == pytest.approx(smape, rel=1e-2)
+        assert len(strict["frames"]) == (2 if where == ("a", "b") else 1)
+    assert "2 frames" in refuses("evaluate", tmp_path / "a", tmp_path / "b" / "b1.exr")
