@@ -12,7 +12,7 @@ from functools import partial
 from importlib.metadata import version
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -157,12 +157,12 @@ def write_frames(
     write = partial(
         _write, sequence, out, report, unwritten, output_layer=output_layer, full_float=full_float, on_file=on_file
     )
-    step = partial(denoiser.output, stages=on_output is not None)
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] = writer.submit(lambda: None)
         seen: Tensor | None = None
-        for number, frame, times in _read_frames(sequence, denoiser, reference=references, of=of, on_read=on_read):
-            output = _denoised(step, sequence, number, denoiser, frame, times)
+        for number, frame, output in denoised_frames(
+            sequence, denoiser, reference=references, stages=on_output is not None, of=of, on_read=on_read
+        ):
             if on_output is not None:
                 on_output(frame, output)
                 output = output._replace(stages={})
@@ -224,41 +224,30 @@ def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: Sequ
 
 
 def denoised_frames(
-    sequence: Sequence, denoiser: Denoiser, *, reference: bool = True
-) -> Iterator[tuple[int, Frame, Tensor]]:
-    """Denoise frame after frame, while the next one is read.
+    sequence: Sequence,
+    denoiser: Denoiser,
+    *,
+    reference: bool = True,
+    stages: bool = False,
+    of: int | None = None,
+    on_read: Callable[[int], object] = lambda number: None,
+) -> Iterator[tuple[int, Frame, Output]]:
+    """Denoise frame after frame, while the next one is read if memory allows.
 
     Args:
         sequence: the frames.
         denoiser: the denoiser; it is reset first.
         reference: also read references.
+        stages: also return stages.
+        of: see :func:`write_frames`.
+        on_read: see :func:`write_frames`.
 
     Yields:
-        Number, frame and image; the denoiser's report includes the time of reading.
+        Number, frame and output; the denoiser's report includes the time of reading.
 
     Raises:
-        InputError: see :func:`denoise_sequence`; the message names the frame.
+        FrameError: see :func:`write_frames`.
     """
-    for number, frame, times in _read_frames(sequence, denoiser, reference=reference):
-        yield number, frame, _denoised(denoiser, sequence, number, denoiser, frame, times)
-
-
-class _Times(NamedTuple):
-    """Milliseconds of reading a frame, and the part of them that denoising had to wait."""
-
-    read: float
-    waiting: float
-
-
-def _read_frames(
-    sequence: Sequence,
-    denoiser: Denoiser,
-    *,
-    reference: bool,
-    of: int | None = None,
-    on_read: Callable[[int], object] = lambda number: None,
-) -> Iterator[tuple[int, Frame, _Times]]:
-    """Read each frame, and the next one ahead if memory allows. Resets the denoiser."""
     if denoiser.model is None:
         denoiser.reset(frames=of or len(sequence))
         denoiser.pick(sequence.first_valid_frame())
@@ -276,6 +265,19 @@ def _read_frames(
         # Depth may be computed from the positions.
         return frame if streaming else frame.with_depth().without_history(), _since(start)
 
+    def denoised(reading: Future[tuple[Frame, float]], number: int, waiting: float) -> tuple[int, Frame, Output]:
+        try:
+            frame, took = reading.result()
+        except InputError as error:
+            raise FrameError(str(error), number) from error
+        try:
+            output = denoiser.output(frame, stages=stages)
+        except InputError as error:
+            raise FrameError(f"{sequence.root}, frame {number}: {error}", number) from error
+        denoiser.report.milliseconds = {"waiting": waiting, **denoiser.report.milliseconds}
+        denoiser.report.beside["read"] = took
+        return number, frame, output
+
     with ThreadPoolExecutor(1) as reader:
         # Keep no reference to a frame here, so that the caller can free it.
         coming: deque[Future[tuple[Frame, float]]] = deque()
@@ -287,38 +289,7 @@ def _read_frames(
             waiting = _since(start)
             if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
                 coming.append(reader.submit(read, following))
-            yield _numbered(number, waiting, *_got(coming.popleft(), number))
-
-
-def _got(reading: Future[tuple[Frame, float]], number: int) -> tuple[Frame, float]:
-    try:
-        return reading.result()
-    except InputError as error:
-        raise FrameError(str(error), number) from error
-
-
-def _numbered(number: int, waiting: float, frame: Frame, read: float) -> tuple[int, Frame, _Times]:
-    return number, frame, _Times(read, waiting)
-
-
-_Result = TypeVar("_Result")
-
-
-def _denoised(
-    denoise: Callable[[Frame], _Result],
-    sequence: Sequence,
-    number: int,
-    denoiser: Denoiser,
-    frame: Frame,
-    times: _Times,
-) -> _Result:
-    try:
-        result = denoise(frame)
-    except InputError as error:
-        raise FrameError(f"{sequence.root}, frame {number}: {error}", number) from error
-    denoiser.report.milliseconds = {"waiting": times.waiting, **denoiser.report.milliseconds}
-    denoiser.report.beside["read"] = times.read
-    return result
+            yield denoised(coming.popleft(), number, waiting)
 
 
 def _pixels(image: Tensor) -> Image:

@@ -239,12 +239,12 @@ def evaluate_method(
     check_references(sequence)
 
     def images() -> Iterator[tuple[int, Tensor, Frame, Tensor]]:
-        for number, frame, image in denoised_frames(sequence, denoiser):
+        for number, frame, output in denoised_frames(sequence, denoiser):
             if frame.reference is None:
                 on_frame(number)
                 continue
             metadata = sequence.metadata(number)
-            image, reference = (to_rec709(each, metadata) for each in (image.cpu(), frame.reference))
+            image, reference = (to_rec709(each, metadata) for each in (output.image.cpu(), frame.reference))
             yield number, image, frame.with_depth().validate()[0], reference
 
     return _evaluate(sequence, name, images(), protocol, on_frame)
