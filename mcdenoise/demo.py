@@ -14,8 +14,9 @@ from torch import Tensor
 
 from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
 from mcdenoise.data import open_sequence
+from mcdenoise.data.files import make_folder
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
-from mcdenoise.folder import denoise_sequence, make_folder
+from mcdenoise.folder import denoise_sequence
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import display_codes

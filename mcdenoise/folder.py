@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.files import check_writable, remove, write_json
+from mcdenoise.data.files import check_writable, make_folder, remove, write_json
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -318,14 +318,6 @@ def _alike(one: Tensor, other: Tensor | None) -> bool:
 
 def _since(start: float) -> float:
     return (time.perf_counter() - start) * 1e3
-
-
-def make_folder(out: Path) -> None:
-    """Create a folder for results; raise ``InputError`` if that is impossible."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: expected a folder that can be written to, found: {error.strerror}") from error
 
 
 def prepare_folder(sequence: Sequence, out: Path) -> None:

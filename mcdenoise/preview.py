@@ -11,11 +11,10 @@ from torch import Tensor
 
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import Metadata
-from mcdenoise.data.files import remove
+from mcdenoise.data.files import make_folder, remove
 from mcdenoise.data.png import Picture, read_png, write_png
 from mcdenoise.data.video import check_video, write_video
 from mcdenoise.errors import InputError
-from mcdenoise.folder import make_folder
 from mcdenoise.metrics import display_codes
 from mcdenoise.nn import auto_exposure
 

@@ -24,8 +24,8 @@ _LARGEST_FILE = 50 * 2**20
 # An unclosed comment hides the rest of the file, so that variables in it count as missing.
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)
 # The patterns do not backtrack: the run time is linear in the length of any text.
-_NUMBER = re.compile(r"[-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?+")
-_LITERAL = re.compile(rf"\s*(?:([{{}},])|({_NUMBER.pattern})[fF]?(?![\w.]))")
+_NUMBER = re.compile(r"([-+]?(?:[0-9]++(?:\.[0-9]*+)?+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?+)[fF]?+(?![\w.])")
+_INITIALISER = re.compile(rf"(?:\s++|[{{}},]|{_NUMBER.pattern})*+")
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,6 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     Raises:
         InputError: the file is missing, too large, incomplete, or contains something other than finite numbers.
     """
-    # A missing file is reported below; opening a pipe would block, and a device has no end.
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise InputError(f"{path}: expected a text file, found a folder, a device or a pipe; remove it")
     try:
         text = read_text(path, _LARGEST_FILE, errors="replace")
     except OSError as error:
@@ -168,20 +165,12 @@ def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> 
 
 
 def _to_json(initialiser: str) -> str:
-    """Turn ``{{1.f, -.5}}`` into ``[[1.0,-0.5]]``."""
-    parts: list[str] = []
-    position = 0
-    initialiser = initialiser.strip()
-    while position < len(initialiser):
-        match = _LITERAL.match(initialiser, position)
-        if match is None:
-            raise ValueError("neither a number nor a brace nor a comma")
-        position = match.end()
-        mark, number = match.groups()
-        if mark == "}" and parts and parts[-1] == ",":
-            parts.pop()  # C allows a comma after the last element, JSON does not.
-        parts.append({"{": "[", "}": "]", ",": ","}[mark] if mark else repr(float(number)))
-    return "".join(parts)
+    """Turn ``{{1.f, -.5}}`` into ``[[1.0, -0.5]]``."""
+    if not _INITIALISER.fullmatch(initialiser):
+        raise ValueError("neither a number nor a brace nor a comma")
+    numbers = _NUMBER.sub(lambda match: repr(float(match[1])), initialiser)
+    # C allows a comma after the last element, JSON does not.
+    return re.sub(r",(?=\s*+\])", "", numbers.replace("{", "[").replace("}", "]"))
 
 
 def _literal(value: float | list[Any]) -> str:

@@ -178,6 +178,18 @@ def new_folder(path: Path) -> Iterator[Path]:
             os.close(handle)
 
 
+def make_folder(path: Path) -> None:
+    """Create a folder for results, if it does not exist.
+
+    Raises:
+        InputError: that is impossible.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: expected a folder that can be written to, found: {error.strerror}") from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically.
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -136,9 +136,8 @@ def read_image_header(path: Path) -> ImageHeader:
     Raises:
         InputError: the file is missing, has another format, or is deep, damaged or unreasonably large.
     """
-    file, header = _open(path)
-    file.close()
-    return header
+    with _opened(path) as (_, header):
+        return header
 
 
 def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice = slice(None)) -> dict[int, Image]:
@@ -157,8 +156,7 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
         InputError: see :func:`read_image_header`; or a part or channel does not exist, or pixels are damaged or
             missing.
     """
-    file, header = _open(path)
-    try:
+    with _opened(path) as (file, header):
         for part, names in wanted.items():
             found = header.parts[part].channels if part < len(header.parts) else ()
             if absent := [name for name in names if name not in found]:
@@ -167,8 +165,6 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
                     f"{', '.join(found[:8]) or 'no such part'}; render all frames with the same layers"
                 )
         return {part: _read(path, file, part, header.parts[part], names, rows) for part, names in wanted.items()}
-    finally:
-        file.close()
 
 
 def read_picture(path: Path) -> tuple[oiio.ImageSpec, ImageHeader, Image]:
@@ -179,12 +175,9 @@ def read_picture(path: Path) -> tuple[oiio.ImageSpec, ImageHeader, Image]:
     Raises:
         InputError: see :func:`read_channels`.
     """
-    file, header = _open(path)
-    try:
+    with _opened(path) as (file, header):
         file.seek_subimage(0, 0)
         return file.spec(), header, _read(path, file, 0, header.parts[0], header.parts[0].channels)
-    finally:
-        file.close()
 
 
 def _read(
@@ -225,7 +218,8 @@ def _read(
     return np.ascontiguousarray(found, dtype=np.float32)
 
 
-def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[oiio.ImageInput, ImageHeader]]:
     # Not Path.is_file, which raises an error for a name that is too long or a folder without access.
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected an image, found {_what_is_at(path)}; check the path")
@@ -243,15 +237,14 @@ def _open(path: Path) -> tuple[oiio.ImageInput, ImageHeader]:
         raise InputError(
             f"{path}: expected an image, found what cannot be opened ({reason}); check that the file is complete"
         )
-    if file.format_name() != name:
-        found = file.format_name()
-        file.close()
-        raise _refused(path, f"a file of the format {found}, which its name does not say", "name it after its format")
     try:
-        return file, _header(path, file, name)
-    except BaseException:
+        if (found := file.format_name()) != name:
+            raise _refused(
+                path, f"a file of the format {found}, which its name does not say", "name it after its format"
+            )
+        yield file, _header(path, file, name)
+    finally:
         file.close()
-        raise
 
 
 def as_stored() -> oiio.ImageSpec:

@@ -9,7 +9,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from mcdenoise.data.exr import write_image
-from mcdenoise.data.images import pending_error
+from mcdenoise.data.images import read_picture
 from mcdenoise.errors import InputError
 
 Picture = NDArray[np.uint8]
@@ -46,15 +46,10 @@ def read_png(path: Path) -> Picture:
     Raises:
         InputError: the file is missing or damaged.
     """
-    file = oiio.ImageInput.open(str(path))
-    if file is None:
-        raise InputError(f"{path}: expected a PNG, found: {pending_error(oiio)}")
-    pixels = file.read_image(0, 0, 0, 3, "uint8")
-    reason = pending_error(file)
-    file.close()
-    if pixels is None or reason or file.spec().nchannels != 3:
-        raise InputError(f"{path}: expected a PNG of 3 channels, found: {reason or file.spec().nchannels}")
-    return np.asarray(pixels, dtype=np.uint8)
+    pixels = read_picture(path)[2]
+    if pixels.shape[2] != 3:
+        raise InputError(f"{path}: expected a PNG of 3 channels, found {pixels.shape[2]}")
+    return np.rint(pixels * 255).astype(np.uint8)
 
 
 def caption(picture: Picture, text: str) -> Picture:

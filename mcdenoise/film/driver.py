@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.data.files import held, sweep, write_json
+from mcdenoise.data.files import held, make_folder, sweep, write_json
 from mcdenoise.engines import Engine, RayEngine, Task, run_tasks
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
@@ -21,7 +21,6 @@ from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import Counter
 from mcdenoise.film.summary import Summary, summarize
 from mcdenoise.film.work import RECORDS, Found, Order
-from mcdenoise.folder import make_folder
 from mcdenoise.results import Results
 
 FILE = "film.json"

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import remove
+from mcdenoise.data.files import make_folder, remove
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.engines import describe_error
@@ -37,7 +37,7 @@ from mcdenoise.film.record import (
     stamp,
     stamp_and_digest,
 )
-from mcdenoise.folder import FrameError, check_apart, make_folder, new_report, write_frames
+from mcdenoise.folder import FrameError, check_apart, new_report, write_frames
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import find_weights, frames_remembered
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, find_camera_matrices
 from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, write_exr
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import make_folder, write_text
 from mcdenoise.data.images import Part, read_image_header, read_picture
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, SPECULAR, find_splits
@@ -33,6 +33,7 @@ from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.motion import USUAL_MOTION
+from mcdenoise.reading import read_text
 
 # File names of the buffers in writing order: color is last, so that a frame that has its color is complete.
 _STEMS = {
@@ -53,7 +54,7 @@ _NAME = re.compile(rf"({'|'.join(_BUFFER_OF)})([0-9]{{1,9}})\.exr")
 # Names that are not used for buffers outside this layout.
 _OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
-_DESCRIPTION, _LARGEST_DESCRIPTION = "camera.json", 2**26
+_DESCRIPTION = "camera.json"
 _FULL_FLOAT = {"position", "previous_position"}
 
 # The file of each frame by buffer.
@@ -313,7 +314,7 @@ def write_bmfr_frame(
     """
     if frame.color.shape[0] != 1:
         raise ValueError(f"frame: expected a batch of 1, found {frame.color.shape[0]}")
-    _make(folder)
+    make_folder(folder)
     # Without it, a reader must assume published BMFR data, whose color is divided by albedo.
     if not (folder / _DESCRIPTION).exists():
         write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
@@ -392,16 +393,9 @@ def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tens
     Raises:
         InputError: a file cannot be written.
     """
-    _make(folder / CLEAN)
+    make_folder(folder / CLEAN)
     write_buffer(folder / CLEAN, number, "albedo", albedo)
     write_buffer(folder / CLEAN, number, "normal", normal)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be created ({error.strerror}); choose another folder") from error
 
 
 def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | None:
@@ -424,11 +418,7 @@ def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
         # Without albedo there is nothing to multiply by: this is ordinary radiance, not the published data.
         return None if albedo_present else True
     try:
-        # Opening a pipe would block, and a device has no end.
-        if not os.path.isfile(description):
-            raise OSError("no file")
-        with description.open(encoding="utf-8") as file:
-            content = json.loads(file.read(_LARGEST_DESCRIPTION))
+        content = json.loads(read_text(description))
         has_albedo = content.get("color_includes_albedo", True)
     except (OSError, ValueError, AttributeError, RecursionError) as error:
         raise InputError(f"{description}: expected a JSON object, found something else; repair or remove it") from error

@@ -19,11 +19,12 @@ from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_image_header
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import Split
-from mcdenoise.data.readers.layers import GREY, Layer, read_layers
+from mcdenoise.data.readers.layers import GREY, Layer, read_files
 from mcdenoise.data.readers.lights import is_light, keeps, kept_together, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
 from mcdenoise.data.readers.samples import SampleLayers
+from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import nothing_hit
@@ -182,16 +183,8 @@ class RenderedFiles(FrameSequence):
                 f"{path}: expected a new name for --output-layer, found '{taken[0]}' in the file; choose another"
             )
 
-    def _write(
-        self,
-        out: Path,
-        number: int,
-        image: Image,
-        alpha: Image | None,
-        lights: Mapping[str, Image],
-        output_layer: str | None,
-        full_float: bool,
-    ) -> Path:
+    def _write(self, out: Path, number: int, result: Denoised) -> Path:
+        image, alpha, lights, output_layer, full_float = result
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
         inside: dict[tuple[int, str], Image] = {}
@@ -331,16 +324,8 @@ class RenderedFiles(FrameSequence):
 
     def read(self, number: int, layers: Iterable[Layer]) -> dict[Layer, Image]:
         """Read layers of one frame, opening each file once: linear light, in the window of all frames."""
-        files: defaultdict[Path, list[Layer]] = defaultdict(list)
-        images: dict[Layer, Image] = {}
-        for layer in layers:
-            path = self.file(layer, number)
-            if (path, layer) in self.kept:
-                images[layer] = self.kept[path, layer]
-            else:
-                files[path].append(layer)
-        for path, own in files.items():
-            images |= read_layers(path, own)
+        # Once a shot is open, nothing is kept.
+        images = read_files(lambda layer: self.file(layer, number), layers, kept=self.kept or None)
         return {layer: self._decoded(number, layer, pixels) for layer, pixels in images.items()}
 
     def read_buffers(self, number: int, names: Iterable[str]) -> dict[str, Image]:

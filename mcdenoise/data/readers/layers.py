@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -182,6 +183,40 @@ def read_layers(path: Path, layers: Iterable[Layer], rows: slice = slice(None)) 
             places.setdefault(channel, len(places))
     found = read_channels(path, {part: list(places) for part, places in wanted.items()}, rows)
     return {layer: found[layer.part][..., [wanted[layer.part][c] for c in layer.channels]] for layer in layers}
+
+
+def read_files(
+    path_of: Callable[[Layer], Path],
+    layers: Iterable[Layer],
+    rows: slice = slice(None),
+    kept: dict[tuple[Path, Layer], Image] | None = None,
+) -> dict[Layer, Image]:
+    """Read some rows of layers, opening each file once.
+
+    Args:
+        path_of: the file of a layer.
+        layers: the layers.
+        rows: contiguous rows of the data window.
+        kept: whole layers that have been read before; it gets those that are read now.
+
+    Raises:
+        InputError: see :func:`read_layers`.
+    """
+    files: defaultdict[Path, list[Layer]] = defaultdict(list)
+    found: dict[Layer, Image] = {}
+    layers = list(layers)
+    for layer in layers:
+        path = path_of(layer)
+        if kept is not None and (path, layer) in kept:
+            found[layer] = kept[path, layer][rows]
+        else:
+            files[path].append(layer)
+    for path, own in files.items():
+        new = read_layers(path, own, rows)
+        found |= new
+        if kept is not None and rows == slice(None):
+            kept |= {(path, layer): pixels for layer, pixels in new.items()}
+    return {layer: found[layer] for layer in layers}
 
 
 def is_luminance(layer: Layer) -> bool:

@@ -24,6 +24,7 @@ import torch
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Mask, Metadata, write_exr
 from mcdenoise.data.readers.names import group_files
+from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
@@ -73,7 +74,7 @@ class _Arrays:
             async def get(store, key: str, prototype: Any, byte_range: Any = None) -> Any:
                 return prototype.buffer.from_bytes(self._read(key)) if key in file.NameToInfo else None
 
-        self.file, self.index = file, index
+        self.file, self.lead = file, () if index is None else (index,)
         # The store's own handle only lists names.
         self._store = Checked(str(file.filename))
         # Bytes of a chunk of each array that is compressed.
@@ -89,19 +90,31 @@ class _Arrays:
         return array
 
     def _read(self, key: str) -> bytes:
-        content = _read(self.file, key)
+        """Read a member of the zip: at most the bytes that it says, which must not be too many for its size."""
+        info = self.file.getinfo(key)
         name, _, chunk = key.partition("/")
+        described = chunk.startswith(".z")
+        if info.file_size > (_SMALL if described else _LARGEST_RATIO * info.compress_size + _SMALL):
+            raise _damaged(self.file, f"'{key}' of {info.file_size} bytes")
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            # These are decompressed whole, whatever size is stated.
+            raise _damaged(self.file, f"'{key}' compressed by another method than deflate")
+        with self.file.open(info) as stream:
+            # With a size, no more than that is decompressed.
+            content = stream.read(info.file_size)
         # Blosc allocates what a chunk says that it holds.
-        if name in self._promised and not chunk.startswith("."):
-            promised = int.from_bytes(content[4:8], "little") if len(content) >= _BLOSC_HEADER else -1
-            if promised != self._promised[name]:
-                raise _damaged(self.file, f"a chunk of '{name}' of another size")
+        promised = -1 if len(content) < _BLOSC_HEADER else int.from_bytes(content[4:8], "little")
+        if len(content) != info.file_size or (not described and promised != self._promised.get(name, promised)):
+            raise _damaged(self.file, f"'{key}' of another size than is stated")
         return content
+
+    def whole(self, name: str) -> Array:
+        """An array without samples."""
+        return np.asarray(self.array(name)[(*self.lead, ...)], np.float64)
 
     def numbers(self, name: str) -> Array:
         """A small array; its numbers must be finite."""
-        array = self.array(name)
-        values = np.asarray(array[...] if self.index is None else array[self.index], np.float64)
+        values = self.whole(name)
         if not np.isfinite(values).all():
             raise _damaged(self.file, f"numbers in '{name}' that are not finite")
         return values
@@ -109,22 +122,20 @@ class _Arrays:
     def pieces(self, name: str) -> Iterator[tuple[slice, slice, Any]]:
         """Rows and samples, and the values of all columns of these, for a strip of chunks at a time."""
         array = self.array(name)
-        lead = () if self.index is None else (self.index,)
-        height, samples = array.shape[len(lead) + 1], array.shape[-1]
-        tall, several = array.chunks[len(lead) + 1], array.chunks[-1]
+        (height, _, samples), (tall, _, several) = array.shape[-3:], array.chunks[-3:]
         for top, first in product(range(0, height, tall), range(0, samples, several)):
             rows, which = slice(top, min(top + tall, height)), slice(first, min(first + several, samples))
-            yield rows, which, array[(*lead, slice(None), rows, slice(None), which)]
+            yield rows, which, array[(*self.lead, slice(None), rows, slice(None), which)]
 
     def mean(self, name: str) -> Array:
         """``(C, H, W)`` mean over the samples, if there are several."""
-        array = self.array(name)
         if name == "reference":
-            return np.asarray(array[...] if self.index is None else array[self.index], np.float64)
-        total = np.zeros(array.shape[-4:-1])
+            return self.whole(name)
+        shape = self.array(name).shape
+        total = np.zeros(shape[-4:-1])
         for rows, _, values in self.pieces(name):
             total[:, rows] += values.sum(-1, dtype=np.float64)
-        return total / array.shape[-1]
+        return total / shape[-1]
 
     def radiance(self, samples_out: Image | None = None) -> tuple[Array, Array | None]:
         r"""Mean ``(3, H, W)`` and the variance of the mean, ``None`` for one sample; fills ``(S, 3, H, W)``.
@@ -251,24 +262,11 @@ class _NoisebaseFiles(FrameSequence):
             found["samples"] = torch.from_numpy(samples)[None]
         return Frame(color=_tensor(color), **found)
 
-    def _write(
-        self,
-        out: Path,
-        number: int,
-        image: Image,
-        alpha: Image | None,
-        lights: Mapping[str, Image],
-        output_layer: str | None,
-        full_float: bool,
-    ) -> Path:
-        """Write an EXR with R, G, B, named after the zip, because the arrays hold samples rather than images.
-
-        If one zip holds all frames, the frame number is appended to the name. There is neither alpha nor a layer. See
-        :meth:`mcdenoise.data.Sequence.write`.
-        """
+    def _write(self, out: Path, number: int, result: Denoised) -> Path:
+        """Write an EXR named after the zip, and the frame number if that holds all: its arrays hold no image."""
         source = self.zips[number]
         target = out / (f"{source.stem}_{number:04d}.exr" if self.has_frames else f"{source.stem}.exr")
-        write_exr(target, image, ["R", "G", "B"], full_float=full_float)
+        write_exr(target, result.image, ["R", "G", "B"], full_float=result.full_float)
         return target
 
 
@@ -395,23 +393,6 @@ def _check_chunks(file: zipfile.ZipFile, name: str, array: ZarrArray[Any]) -> No
         raise _damaged(file, f"'{name}' without all of its chunks")
     if math.prod(array.chunks) * array.dtype.itemsize > _LARGEST_RATIO * max(sizes) + _SMALL:
         raise _damaged(file, f"chunks of '{name}' of shape {array.chunks}")
-
-
-def _read(file: zipfile.ZipFile, name: str) -> bytes:
-    """Read a member of a zip: at most the bytes that it says, which must not be too many for its size."""
-    info = file.getinfo(name)
-    described = name.rpartition("/")[2].startswith(".z")
-    if info.file_size > (_SMALL if described else _LARGEST_RATIO * info.compress_size + _SMALL):
-        raise _damaged(file, f"'{name}' of {info.file_size} bytes")
-    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        # These are decompressed whole, whatever size is stated.
-        raise _damaged(file, f"'{name}' compressed by another method than deflate")
-    with file.open(info) as stream:
-        # With a size, no more than that is decompressed.
-        content = stream.read(info.file_size)
-    if len(content) != info.file_size:
-        raise _damaged(file, f"'{name}' of {len(content)} bytes instead of {info.file_size}")
-    return content
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import find_camera_matrices
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
-from mcdenoise.data.readers.choice import Choice, Read, choose
+from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
     EMISSION,
@@ -27,7 +27,7 @@ from mcdenoise.data.readers.diffuse_specular import (
 )
 from mcdenoise.data.readers.examining import examine, examine_parts
 from mcdenoise.data.readers.files import RenderedFiles
-from mcdenoise.data.readers.layers import Layer, layers_of, read_layers, recognise
+from mcdenoise.data.readers.layers import Layer, layers_of, read_files, read_layers, recognise
 from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, split_samples
@@ -74,7 +74,11 @@ def open_files(
     ]
     kept: dict[tuple[Path, Layer], Image] = {}
     samples, layers = split_samples(layers)
-    choice = choose(where, layers, mapping, _reader(lambda layer: next(iter(groups[layer.group].files.values())), kept))
+
+    def read(wanted: Sequence[Layer], rows: slice) -> dict[Layer, Image]:
+        return read_files(lambda layer: next(iter(groups[layer.group].files.values())), wanted, rows, kept)
+
+    choice = choose(where, layers, mapping, read)
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
@@ -90,24 +94,6 @@ def open_files(
     if not _FEATURES & {*choice.layers, *mapping}:
         _look_beside(shot)
     return shot
-
-
-def _reader(path_of: Callable[[Layer], Path], kept: dict[tuple[Path, Layer], Image]) -> Read:
-    """A function that reads layers of the first frame, and keeps whole ones."""
-
-    def read(layers: Sequence[Layer], rows: slice) -> dict[Layer, Image]:
-        files: defaultdict[Path, list[Layer]] = defaultdict(list)
-        for layer in layers:
-            files[path_of(layer)].append(layer)
-        found: dict[Layer, Image] = {}
-        for path, own in files.items():
-            new = read_layers(path, [layer for layer in own if (path, layer) not in kept], rows)
-            if rows == slice(None):
-                kept.update({(path, layer): pixels for layer, pixels in new.items()})
-            found |= {layer: new[layer] if layer in new else kept[path, layer][rows] for layer in own}
-        return found
-
-    return read
 
 
 def _parts(header: ImageHeader, color_space: ColorSpace) -> tuple[Part, ...]:
@@ -159,7 +145,7 @@ def open_result(path: Path) -> Result:
         InputError: the file cannot be read, or its radiance cannot be determined.
     """
     parts = read_image_header(path).parts
-    chosen = choose(str(path), layers_of(0, "", parts), {}, _reader(lambda layer: path, {}))
+    chosen = choose(str(path), layers_of(0, "", parts), {}, functools.partial(read_layers, path))
     (layer, *_) = chosen.written
     return Result(path, layer, parts[layer.part].window)
 
@@ -189,13 +175,6 @@ def check_files(
             raise InputError(
                 f"{pattern_of(shot.groups[layer.group])}: expected buffer '{name}' for every frame, found none for "
                 f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
-            )
-        part = shot.part_of(layer)
-        if part.window != main.window and (one_window or part.display != main.display):
-            raise InputError(
-                f"{next(iter(shot.groups[layer.group].files.values()))}: expected '{name}' in the pixels of the color "
-                f"({_window(main)}), found {_window(part)}; render all layers in one window, or leave this one "
-                f"out with --map {name}="
             )
     written = [color, *shot.choice.written]
     used = dict.fromkeys([*written, *shot.choice.layers.values()])
@@ -243,7 +222,7 @@ def _check_window(path: Path, header: ImageHeader, layer: Layer, main: Part, one
     if part.window != main.window and (one_window or part.display != main.display):
         raise InputError(
             f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
-            "buffers and frames at one size, or crop them in one display window"
+            "buffers and frames at one size, or crop them in one display window, or leave a buffer out with --map"
         )
 
 
@@ -272,16 +251,14 @@ def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Im
     """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
     main, number = shot.part_of(shot.choice.layers["color"]), shot.numbers[0]
     height, width = main.size
-    files: defaultdict[Path, list[Layer]] = defaultdict(list)
-    for layer in dict.fromkeys(layers):
-        if shot.part_of(layer).window == main.window and shot.has(layer, number):
-            files[shot.file(layer, number)].append(layer)
+    same = [layer for layer in dict.fromkeys(layers) if shot.part_of(layer).window == main.window]
+    same = [layer for layer in same if shot.has(layer, number)]
     found: defaultdict[Layer, list[Image]] = defaultdict(list)
-    for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int):
-        for path, own in files.items():
-            for layer, pixels in read_layers(path, own, slice(int(top), int(top) + _STRIP)).items():
-                part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3].reshape(-1, 3)
-                found[layer].append(decode(image, part.gamma) if part.display_referred else image)
+    for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int).tolist():
+        strips = read_files(lambda layer: shot.file(layer, number), same, slice(top, top + _STRIP))
+        for layer, pixels in strips.items():
+            part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3].reshape(-1, 3)
+            found[layer].append(decode(image, part.gamma) if part.display_referred else image)
     return {layer: np.concatenate(strips) for layer, strips in found.items()}
 
 

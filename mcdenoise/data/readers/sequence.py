@@ -8,7 +8,7 @@ from collections.abc import Sequence as Sequential
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -23,6 +23,16 @@ from mcdenoise.frame import Frame
 # Files may contain any values, also infinite ones, which are checked when a frame is used: suppress numpy's warnings.
 any_values = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 _Self = TypeVar("_Self", bound="Sequence")
+
+
+class Denoised(NamedTuple):
+    """What is written of a frame, see :meth:`Sequence.write`."""
+
+    image: Image
+    alpha: Image | None
+    lights: Mapping[str, Image]
+    output_layer: str | None
+    full_float: bool
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -234,7 +244,7 @@ class Sequence(ABC):
         self._check(number)
         if output_layer is not None:
             self.check_output_layer(output_layer)
-        return self._write(out, number, image, alpha, lights or {}, output_layer, full_float)
+        return self._write(out, number, Denoised(image, alpha, lights or {}, output_layer, full_float))
 
     def _check(self, number: int) -> None:
         if number not in self.numbers:
@@ -254,16 +264,7 @@ class Sequence(ABC):
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame: ...
 
     @abstractmethod
-    def _write(
-        self,
-        out: Path,
-        number: int,
-        image: Image,
-        alpha: Image | None,
-        lights: Mapping[str, Image],
-        output_layer: str | None,
-        full_float: bool,
-    ) -> Path: ...
+    def _write(self, out: Path, number: int, result: Denoised) -> Path: ...
 
 
 def summary(numbers: Sequential[int]) -> str:
