@@ -87,13 +87,13 @@ DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
 )
 
 
-def outcomes(folder: Path, files: Mapping[str, bytes], written: Path | None = None) -> dict[str, str]:
+def outcomes(folder: Path, files: Mapping[str, bytes], written: Path) -> dict[str, str]:
     """Return what the reader made of each file; the effects on the process are asserted here.
 
     Args:
         folder: for the files.
         files: contents by name.
-        written: where each is written after it was read as a shot; else it is read as matrices.
+        written: folder to write each to, after it was read as a shot.
     """
     folder.mkdir()
     for name, content in files.items():
@@ -101,14 +101,13 @@ def outcomes(folder: Path, files: Mapping[str, bytes], written: Path | None = No
     return outcomes_of(folder, written)
 
 
-def outcomes_of(folder: Path, written: Path | None = None) -> dict[str, str]:
+def outcomes_of(folder: Path, written: Path) -> dict[str, str]:
     """Return what the reader made of each file of a folder, see :func:`outcomes`."""
     names = {path.name for path in folder.iterdir()}
-    if written is not None:
-        written.mkdir()
+    written.mkdir()
     # Loading the libraries takes some seconds on a busy machine.
     limit = 60 + SECONDS_A_FILE * len(names)
-    arguments = [sys.executable, WORKER, folder, *([] if written is None else [written])]
+    arguments = [sys.executable, WORKER, folder, written]
     try:
         run = subprocess.run(arguments, capture_output=True, text=True, timeout=limit, check=False)
     except subprocess.TimeoutExpired as error:

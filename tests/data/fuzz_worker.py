@@ -1,6 +1,6 @@
 """Reads each file of a folder in a process of its own, with little memory: one line of JSON for each on stdout.
 
-They are matrices; or with a second folder, each is opened as the shot of a renderer, and its frame is written there.
+Each is opened as the shot of a renderer, and its frame is written to a second folder.
 """
 
 import json
@@ -14,7 +14,6 @@ import kornia.color  # noqa: F401 - before memory is counted
 import numpy as np
 import OpenEXR  # noqa: F401
 
-from mcdenoise.data.camera_matrices import read_camera_matrices
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
@@ -50,17 +49,14 @@ def read_and_write(path: Path, out: Path) -> None:
         raise AssertionError(f"{path}: written with other channels")
 
 
-def main(folder: Path, out: Path | None) -> None:
+def main(folder: Path, out: Path) -> None:
     # They would stand on the screen beside the one line.
     warnings.simplefilter("error")
     resource.setrlimit(resource.RLIMIT_AS, (taken() + MEMORY, -1))
     for path in sorted(folder.iterdir()):
         print(json.dumps({"begun": path.name}), flush=True)
         try:
-            if out is None:
-                read_camera_matrices(path)
-            else:
-                read_and_write(path, out / path.name)
+            read_and_write(path, out / path.name)
             outcome = ""
         except InputError as error:
             outcome = str(error)
@@ -71,4 +67,4 @@ def main(folder: Path, out: Path | None) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]) if len(sys.argv) > 2 else None)
+    main(*map(Path, sys.argv[1:]))

@@ -2,43 +2,45 @@
 
 import json
 import os
+import signal
 import stat
-import subprocess
 import sys
 import time
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
 
 from mcdenoise.data import files
-from mcdenoise.data.files import held, new_folder, write_json, write_text
+from mcdenoise.data.files import atomic_path, held, new_folder, write_json, write_text
 from mcdenoise.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and locks")
 
-STUCK = """
-import sys, time
-from pathlib import Path
-from mcdenoise.data.files import atomic_path, new_folder
-with {how}(Path(sys.argv[1])) as temporary:
-    (temporary / "half" if temporary.is_dir() else temporary).write_text("half of it")
-    print("writing", flush=True)
-    time.sleep(600)
-"""
+
+def stuck(how: Callable[[Path], AbstractContextManager[Path]], path: Path) -> int:
+    """The id of a process in the middle of writing."""
+    ready, told = os.pipe()
+    with warnings.catch_warnings():
+        # It runs nothing of the threads that torch has started.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if not child:
+        with how(path) as temporary:
+            (temporary / "half" if temporary.is_dir() else temporary).write_text("half of it")
+            os.write(told, b"!")
+            time.sleep(600)
+    assert os.read(ready, 1)
+    os.close(ready)
+    os.close(told)
+    return child
 
 
-def stuck(how: str, path: Path) -> subprocess.Popen[str]:
-    """A process in the middle of writing."""
-    command = [sys.executable, "-c", STUCK.format(how=how), str(path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "writing\n"
-    return process
-
-
-def end(process: subprocess.Popen[str]) -> None:
-    with process:
-        process.kill()
+def end(process: int) -> None:
+    os.kill(process, signal.SIGKILL)
+    os.waitpid(process, 0)
 
 
 def age(folder: Path) -> None:
@@ -47,8 +49,10 @@ def age(folder: Path) -> None:
         os.utime(path, (time.time() - 3600,) * 2)
 
 
-@pytest.mark.parametrize("how", ["atomic_path", "new_folder"])
-def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(tmp_path: Path, how: str) -> None:
+@pytest.mark.parametrize("how", [atomic_path, new_folder])
+def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(
+    tmp_path: Path, how: Callable[[Path], AbstractContextManager[Path]]
+) -> None:
     others = [".mcdenoise", ".mcdenoise-mine", ".file.tmp", "file.tmp"]
     for name in others:
         (tmp_path / name).write_text("somebody's")

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-import OpenImageIO as oiio
 import pytest
 from damage import (
     DAMAGES,
@@ -27,8 +26,7 @@ from damage import (
     truncated,
 )
 from damage import numbers as extreme_numbers
-
-from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from pictures import save
 
 RENDERERS = Path(__file__).with_name("renderers")
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256", "HTJ2K32")
@@ -60,14 +58,9 @@ def write_exr(path: Path, *parts: dict[str, np.ndarray], compression: str = "ZIP
 
 
 def write_picture(path: Path, channels: int, kind: str, *, tile: int = 0, **attributes: object) -> None:
-    spec = oiio.ImageSpec(SIZE[1], SIZE[0], channels, kind)
-    spec.tile_width = spec.tile_height = tile
-    for name, value in attributes.items():
-        spec.attribute(name.replace("__", ":"), value)
-    file = oiio.ImageOutput.create(str(path))
-    assert file.open(str(path), spec), file.geterror()
-    assert file.write_image(drawn(channels))
-    assert file.close(), file.geterror()
+    names = {1: "Y", 3: "RGB", 4: "RGBA"}[channels]
+    images = dict(zip(names, np.moveaxis(drawn(channels), -1, 0), strict=True))
+    save(path, images, kind, tile_width=tile, tile_height=tile, **attributes)
 
 
 @pytest.fixture(scope="module")
@@ -191,37 +184,3 @@ def test_a_hollow_file_takes_no_memory(tmp_path: Path, intact: dict[str, bytes])
     found = outcomes(tmp_path / "exr", files, tmp_path / "written")
     assert_clear(tmp_path / "exr", found)
     assert all(found.values())
-
-
-MATRICES_TEXT = (*b"{ } , ; = [ ] nan 1e999 - 0x // /* \0 \xff".split(b" "), b"9" * 400)
-
-
-def damaged_matrices(g: Generator, content: bytes) -> bytes:
-    """Damage as of any file, pieces of C thrown in, and very deep and very long initialisers."""
-    choice = int(g.integers(0, 6))
-    if choice == 0:
-        return truncated(g, content)
-    if choice == 1:
-        return flipped(g, content)
-    if choice == 2:
-        return spliced(g, content)
-    if choice == 3:
-        depth = int(10 ** g.uniform(1, 5))
-        return content.replace(b"= {", b"= " + b"{" * depth, 1)
-    if choice == 4:
-        count = int(10 ** g.uniform(1, 5))
-        return content.replace(b"= {", b"= {" + b"{1.0f}, " * count, 1)
-    for _ in range(int(g.integers(1, 20))):
-        start = int(g.integers(0, len(content)))
-        content = content[:start] + MATRICES_TEXT[int(g.integers(0, len(MATRICES_TEXT)))] + content[start:]
-    return content
-
-
-def test_damaged_camera_matrices(tmp_path: Path) -> None:
-    g, folder, count = np.random.default_rng(0), tmp_path / "matrices", 60
-    cameras = CameraMatrices(g.normal(size=(5, 4, 4)), np.full((5, 2), 0.5), 0.01, 0.25)
-    write_camera_matrices(tmp_path / "camera_matrices.h", cameras, "scene")
-    content = (tmp_path / "camera_matrices.h").read_bytes()
-    found = outcomes(folder, {f"{i:05d}.h": damaged_matrices(g, content) for i in range(count)})
-    assert_clear(folder, found)
-    assert sum(bool(outcome) for outcome in found.values()) > count / 3

@@ -10,7 +10,7 @@ from mcdenoise.data import open_sequence, write_exr
 SIZE = 9, 10
 
 
-@pytest.mark.parametrize("pattern", ["{}.exr", "{}0001.exr", "kitchen_{}.exr", "{}_0003.exr", "kitchen-{}-0012.exr"])
+@pytest.mark.parametrize("pattern", ["{}.exr", "{}0001.exr", "kitchen-{}-0012.exr"])
 def test_the_whole_comes_before_its_halves_and_the_rest_is_named(tmp_path: Path, pattern: str) -> None:
     g, written = np.random.default_rng(0), {}
     for buffer in ("color", "albedo", "normal", "depth"):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
@@ -23,7 +24,7 @@ def groups(*names: str) -> dict[str, dict[int, str]]:
 
 
 @pytest.fixture
-def image(save: Callable[..., Path], tmp_path: Path) -> Callable[..., list[Path]]:
+def image(tmp_path: Path) -> Callable[..., list[Path]]:
     """Write small pictures of red, green and blue; the red of each is its place among them."""
 
     def written(*names: str) -> list[Path]:

@@ -1,7 +1,7 @@
 """Diffuse and specular light from files: used where it adds up to the color, refused in words where it does not."""
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from commands import run
+from pictures import save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
@@ -17,7 +18,6 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, save_weights
 
 SIZE = (12, 16)
-Save = Callable[..., Path]
 Image = np.ndarray[Any, Any]
 
 # Blender's passes, and which buffer each belongs to.
@@ -65,7 +65,7 @@ def image_of(frame: Frame, buffer: str) -> Image:
 
 
 @pytest.mark.parametrize("kind", ["float", "half"])
-def test_blenders_passes_are_added_with_their_colors(tmp_path: Path, save: Save, kind: str) -> None:
+def test_blenders_passes_are_added_with_their_colors(tmp_path: Path, kind: str) -> None:
     channels, truth = blender()
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels, kind))
     assert sequence.buffers >= {"diffuse", "specular", "specular_albedo"}
@@ -79,7 +79,7 @@ def test_blenders_passes_are_added_with_their_colors(tmp_path: Path, save: Save,
 
 
 @pytest.mark.parametrize("absent", [["Emit"], ["TransInd", "Env"], ["GlossDir"], ["DiffInd"]])
-def test_missing_passes_are_named_and_no_part_is_used(tmp_path: Path, save: Save, absent: list[str]) -> None:
+def test_missing_passes_are_named_and_no_part_is_used(tmp_path: Path, absent: list[str]) -> None:
     channels, _ = blender(*absent)
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", channels, "half"))
     assert not sequence.buffers & {"diffuse", "specular", "specular_albedo"}
@@ -91,7 +91,7 @@ def test_missing_passes_are_named_and_no_part_is_used(tmp_path: Path, save: Save
     assert frame.specular is None
 
 
-def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Save) -> None:
+def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path) -> None:
     channels, truth = blender()
     smooth = truth["color"].mean((0, 1), keepdims=True) + 0 * truth["color"]
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", {**channels, **three("View.Combined", smooth)}))
@@ -105,7 +105,7 @@ def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path, save: Sav
 
 @pytest.mark.parametrize("layout", ["layers", "files", "files of a shot"])
 @pytest.mark.parametrize("emits", [False, True])
-def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, layout: str, emits: bool) -> None:
+def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, layout: str, emits: bool) -> None:
     images = {"diffuse": drawn(0), "specular": drawn(1), "specular_albedo": drawn(2) / 2}
     images |= {"emission": drawn(3)} if emits else {}
     images["color"] = sum(
@@ -130,7 +130,7 @@ def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, save: Save, 
     assert (frame.emission is not None) == emits
 
 
-def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path, save: Save) -> None:
+def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path) -> None:
     channels, _ = blender()
     save(tmp_path / "shot_0001.exr", channels)
     save(tmp_path / "shot_0002.exr", {**channels, **three("View.Emit", 5 * drawn(9))})
@@ -168,7 +168,7 @@ def as_channels(layers: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["float", "half"])
-def test_all_layers_are_those_that_complete_the_sum(kind: str, save: Callable[..., Path], tmp_path: Path) -> None:
+def test_all_layers_are_those_that_complete_the_sum(kind: str, tmp_path: Path) -> None:
     diffuse, glossy, coat, sky, lamp = shares(5)
     copy = diffuse + glossy + coat
     color = copy + 0
@@ -199,7 +199,7 @@ def test_all_layers_are_those_that_complete_the_sum(kind: str, save: Callable[..
     torch.testing.assert_close(sum(frame.layers.values()), frame.color, rtol=4e-3, atol=1e-3)
 
 
-def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path) -> None:
+def test_what_no_layer_holds_is_said(tmp_path: Path) -> None:
     diffuse, glossy, coat = shares(3)
     channels = as_channels({"": diffuse + glossy + coat, "DiffuseThing": diffuse, "diffuse_direct": diffuse})
     sequence = open_sequence(save(tmp_path / "a.exr", channels), lights=("all",))
@@ -218,7 +218,7 @@ def test_what_no_layer_holds_is_said(save: Callable[..., Path], tmp_path: Path) 
     )
 
 
-def test_a_transparent_film_has_no_sky(rendered: Path, save: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_transparent_film_has_no_sky(rendered: Path, tmp_path: Path) -> None:
     path = rendered / "blender" / "shot_0001.exr"
     names = read_image_header(path).parts[0].channels
     pixels = dict(zip(names, np.moveaxis(read_channels(path, {0: names})[0], -1, 0), strict=True))

@@ -9,6 +9,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from commands import run
+from pictures import save
 
 from mcdenoise.data import open_sequence
 
@@ -18,17 +19,8 @@ SIZE = (12, 16)
 
 def picture(path: Path, kind: str, channels: int = 3, **attributes: Any) -> Image:
     """Write random values, and return them as stored."""
-    pixels = np.random.default_rng(0).integers(1, 200, (*SIZE, channels)).astype(np.float32) / 255
-    spec = oiio.ImageSpec(SIZE[1], SIZE[0], channels, kind)
-    for name, value in attributes.items():
-        if name == "ICCProfile":
-            spec.attribute(name, oiio.TypeDesc(f"uint8[{len(value)}]"), value)
-        else:
-            spec.attribute(name.replace("__", ":"), value)
-    output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec), output.geterror()
-    assert output.write_image(pixels), output.geterror()
-    assert output.close()
+    pixels = np.random.default_rng(0).integers(1, 200, (*SIZE, channels)) / 255
+    save(path, dict(zip("RGB" if channels > 1 else "Y", np.moveaxis(pixels, -1, 0), strict=True)), kind, **attributes)
     return stored(path)
 
 
@@ -121,7 +113,7 @@ def test_the_color_space_of_a_picture_is_kept(
 
 
 @pytest.mark.parametrize("names", ["Y", "Y A", "beauty.Y depth.Z"])
-def test_one_channel_is_denoised_and_written_as_one(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
+def test_one_channel_is_denoised_and_written_as_one(names: str, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     channels = {name: np.ones(SIZE, np.float32) for name in names.split()}
     first = next(iter(channels))
@@ -144,7 +136,7 @@ def test_one_channel_is_denoised_and_written_as_one(names: str, save: Callable[.
 
 
 @pytest.mark.parametrize("names", ["XYZA", "Y"])
-def test_the_color_in_another_space_is_written_too(names: str, save: Callable[..., Path], tmp_path: Path) -> None:
+def test_the_color_in_another_space_is_written_too(names: str, tmp_path: Path) -> None:
     """Mitsuba's films write XYZ or luminance beside the RGB of the nested integrator: never half of a file."""
     to_xyz = np.array([[0.412453, 0.35758, 0.180423], [0.212671, 0.71516, 0.072169], [0.019334, 0.119193, 0.950227]])
     color = np.random.default_rng(0).gamma(1, 1, (*SIZE, 3)).astype(np.float32)

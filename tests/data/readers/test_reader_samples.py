@@ -1,6 +1,5 @@
 """Single samples of pixels from files: layers of an EXR whose mean is its color."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from commands import run
+from pictures import save
 
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
@@ -15,7 +15,6 @@ from mcdenoise.data.readers.samples import write_samples
 from mcdenoise.frame import Frame
 
 COUNT, SIZE = 3, (12, 16)
-Save = Callable[..., Path]
 Image = np.ndarray[Any, Any]
 
 
@@ -39,7 +38,7 @@ def in_color(samples: Image) -> dict[str, Image]:
 
 
 @pytest.mark.parametrize("kind", ["float", "half"])
-def test_layers_beside_the_color(tmp_path: Path, save: Save, kind: str) -> None:
+def test_layers_beside_the_color(tmp_path: Path, kind: str) -> None:
     samples = drawn()
     sequence = open_sequence(save(tmp_path / "shot_0001.exr", in_color(samples), kind))
     assert "samples" in sequence.buffers
@@ -86,7 +85,7 @@ def test_samples_whose_mean_is_not_the_color_are_not_used(tmp_path: Path, layout
 
 
 @pytest.mark.parametrize("model", ["sbmc", "layered"])
-def test_methods_of_samples_run_on_those_of_files(save: Save, tmp_path: Path, model: str) -> None:
+def test_methods_of_samples_run_on_those_of_files(tmp_path: Path, model: str) -> None:
     samples = drawn()
     for number in (1, 2):
         save(tmp_path / "in" / f"shot_000{number}.exr", in_color(samples))
