@@ -11,11 +11,11 @@ import itertools
 import multiprocessing
 import os
 import platform
-from collections.abc import Callable, Hashable, Iterable
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterable
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.metadata import version
-from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from mcdenoise.errors import InputError
@@ -52,28 +52,24 @@ class Task:
     progress: Callable[[], object] = lambda: None
 
 
-@dataclass(frozen=True)
-class Done:
-    """How a call ended: with an answer, with an error, or without a word, because the worker was lost."""
-
-    answer: Any = None
-    error: BaseException | None = None
-    lost: str = ""
+# The answer of a call; or none, and why it failed.
+Outcome = tuple[Any, str | None]
 
 
 class Engine(Protocol):
     """Runs calls in workers, which are other processes."""
 
-    def free_slots(self) -> int:
-        """How many calls may be submitted now."""
+    @property
+    def lost(self) -> tuple[type[BaseException], ...]:
+        """What the future of a call raises if its worker was lost."""
         ...
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
-        """Start a call, and return its handle."""
+    def slots(self) -> int:
+        """How many calls may run or wait at a time."""
         ...
 
-    def finished(self, seconds: float) -> dict[Hashable, Done]:
-        """The calls that ended since the last time, by handle; waits at most ``seconds`` for the first of them."""
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
+        """Start a call; its result is the answer, or ``None`` and why it failed."""
         ...
 
     def close(self) -> None:
@@ -93,7 +89,7 @@ def run_tasks(engine: Engine, tasks: Iterable[Task], on_wait: Callable[[], objec
     """
     counter = itertools.count()
     queue: list[tuple[int, int, _Attempt]] = []
-    running: dict[Hashable, tuple[int, int, _Attempt]] = {}
+    running: dict[Future[Outcome], tuple[int, int, _Attempt]] = {}
 
     def add(new: Iterable[Task]) -> None:
         for task in new:
@@ -102,21 +98,23 @@ def run_tasks(engine: Engine, tasks: Iterable[Task], on_wait: Callable[[], objec
     with closing(engine):
         add(tasks)
         while queue or running:
-            for _ in range(min(len(queue), engine.free_slots()) if queue else 0):
+            while queue and len(running) < engine.slots():
                 place = heapq.heappop(queue)
                 task = place[-1].task
                 running[engine.submit(task.function, *task.arguments)] = place
-            for handle, done in engine.finished(_SECONDS_BETWEEN_POLLS).items():
-                place = running.pop(handle)
+            for call in wait(running, _SECONDS_BETWEEN_POLLS, FIRST_COMPLETED).done:
+                place = running.pop(call)
                 attempt = place[-1]
-                if attempt.is_repeated(done):
-                    heapq.heappush(queue, place)
-                elif done.lost:
-                    add(attempt.task.on_failed(f"{done.lost}, {attempt.losses} times in a row"))
-                elif done.error is not None:
-                    add(attempt.task.on_failed(describe_error(done.error)))
-                else:
-                    add(attempt.task.on_done(done.answer))
+                try:
+                    answer, failure = call.result()
+                except engine.lost as error:
+                    if attempt.is_repeated():
+                        heapq.heappush(queue, place)
+                        continue
+                    failure = f"its worker was lost, {attempt.losses} times in a row ({type(error).__name__})"
+                except Exception as error:  # an answer that cannot be sent
+                    failure = describe_error(error)
+                add(attempt.task.on_done(answer) if failure is None else attempt.task.on_failed(failure))
             on_wait()
 
 
@@ -126,13 +124,24 @@ class _Attempt:
     progress: object
     losses: int = 0
 
-    def is_repeated(self, done: Done) -> bool:
-        """Whether the task lost its worker and is tried again."""
-        if not done.lost:
-            return False
+    def is_repeated(self) -> bool:
+        """Whether the task, which has lost its worker, is tried again."""
         before, self.progress = self.progress, self.task.progress()
         self.losses = 1 if self.progress != before else self.losses + 1
         return self.losses < MOST_LOSSES
+
+
+def _call(driver: str, function: Callable[..., Any], *arguments: Any) -> Outcome:
+    """In a worker of the driver's version: the answer of a call, or why it failed."""
+    try:
+        if driver != version("mcdenoise"):
+            raise InputError(
+                f"mcdenoise: expected version {driver}, as the driver has, found {version('mcdenoise')} on "
+                f"{platform.node()}; install the same version on all machines"
+            )
+        return function(*arguments), None
+    except BaseException as error:  # a user's model may even exit, and not every error can be sent
+        return None, describe_error(error)
 
 
 def describe_error(error: BaseException) -> str:
@@ -179,92 +188,51 @@ def open_engine(workers: str, *, cpus: float = 1, gpus: float = 0) -> Engine:
 class LocalEngine:
     """Worker processes of this machine.
 
-    Each has a pipe of its own, and shares no lock, server or queue with others: one that is killed is lost alone.
+    Each is a pool of its own, and shares no queue with others: one that is killed is lost alone.
 
     Args:
         workers: number of processes, at least 1.
     """
 
+    lost = (BrokenExecutor,)
+
     def __init__(self, workers: int) -> None:
-        self._workers = workers
-        self._idle: list[_Worker] = []
-        self._running: dict[Hashable, _Worker] = {}
-        self._handles = itertools.count()
         start_resource_tracker()
+        self._pools = [_pool() for _ in range(workers)]
+        self._calls: list[Future[Outcome] | None] = [None] * workers
 
-    def free_slots(self) -> int:
+    def slots(self) -> int:
         """See :class:`Engine`."""
-        return self._workers - len(self._running)
+        return len(self._pools)
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
         """See :class:`Engine`."""
-        handle = next(self._handles)
+        free = next(place for place, call in enumerate(self._calls) if call is None or call.done())
+        call = _call, version("mcdenoise"), function, *arguments
         with deaf_children():
-            worker = self._running[handle] = self._idle.pop() if self._idle else _Worker()
-        # One that was killed while it was idle is found when the task is waited for.
-        with suppress(ConnectionError):
-            worker.pipe.send((function, arguments))
-        return handle
-
-    def finished(self, seconds: float) -> dict[Hashable, Done]:
-        """See :class:`Engine`."""
-        found: dict[Hashable, Done] = {}
-        ready = wait([worker.pipe for worker in self._running.values()], seconds)
-        for handle in [handle for handle, worker in self._running.items() if worker.pipe in ready]:
-            worker = self._running.pop(handle)
             try:
-                found[handle] = worker.pipe.recv()
-                self._idle.append(worker)
-            except (EOFError, OSError):
-                worker.end()
-                found[handle] = Done(lost="its process ended without a word, perhaps for lack of memory")
-        return found
+                self._calls[free] = made = self._pools[free].submit(*call)
+            except BrokenExecutor:
+                self._pools[free] = _pool()
+                self._calls[free] = made = self._pools[free].submit(*call)
+        return made
 
     def close(self) -> None:
         """See :class:`Engine`."""
-        running = list(self._running.values())
-        for worker in self._idle:
-            worker.pipe.close()
-        for worker in running:
-            worker.process.terminate()
-        for worker in running:
-            worker.process.join(_SECONDS_TO_END / len(running))
-            worker.end()
-        self._idle, self._running = [], {}
+        processes = [process for pool in self._pools for process in (pool._processes or {}).values()]
+        for pool in self._pools:
+            pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join(_SECONDS_TO_END / len(processes))
+            process.kill()
+        self._pools, self._calls = [], []
 
 
-class _Worker:
-    """A process that runs the calls which it gets through a pipe, until the pipe is closed."""
-
-    def __init__(self) -> None:
-        # A fork of a process with threads may hold their locks for ever.
-        context = multiprocessing.get_context("spawn")
-        self.pipe, other = context.Pipe()
-        self.process = context.Process(target=_work, args=(other,))
-        self.process.start()
-        # Only the worker has that end now, so that its death closes the pipe.
-        other.close()
-
-    def end(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self.pipe.close()
-
-
-def _work(pipe: Connection) -> None:
-    """In a worker: run calls."""
-    prepare_worker()
-    while True:
-        try:
-            function, arguments = pipe.recv()
-        except EOFError:
-            return
-        try:
-            done = Done(function(*arguments))
-        except BaseException as error:  # a user's model may even exit
-            # Not every error can be sent, or be made again by the driver.
-            done = Done(error=InputError(describe_error(error)))
-        pipe.send(done)
+def _pool() -> ProcessPoolExecutor:
+    # A fork of a process with threads may hold their locks for ever.
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=prepare_worker)
 
 
 class RayEngine:
@@ -290,6 +258,7 @@ class RayEngine:
                 "pip install 'mcdenoise[ray]'"
             ) from error
         self._ray: Any = ray
+        self.lost = (ray.exceptions.RayError,)
         self._begun = not ray.is_initialized()
         if self._begun:
             try:
@@ -303,54 +272,31 @@ class RayEngine:
         self._cpus, self._gpus = cpus, gpus
         # Not Ray but `run_tasks` retries, which knows what the task has finished.
         options = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": 0, "scheduling_strategy": "SPREAD"}
-        self._call = self._ray.remote(**options)(_call)
-        self._running: list[Any] = []
+        self._call = ray.remote(**options)(_call)
+        self._calls: dict[Future[Outcome], Any] = {}
 
-    def free_slots(self) -> int:
+    def slots(self) -> int:
         """See :class:`Engine`: as many as the cluster can run now, and some that wait for it."""
         resources = self._ray.cluster_resources()
         slots = resources.get("CPU", 0) / max(self._cpus, 1e-3)
         if self._gpus:
             slots = min(slots, resources.get("GPU", 0) / self._gpus)
-        return max(1, int(slots * 1.25) + 1) - len(self._running)
+        return max(1, int(slots * 1.25) + 1)
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
         """See :class:`Engine`."""
-        self._running.append(self._call.remote(version("mcdenoise"), function, *arguments))
-        return self._running[-1]  # type: ignore[no-any-return]
-
-    def finished(self, seconds: float) -> dict[Hashable, Done]:
-        """See :class:`Engine`."""
-        if not self._running:
-            return {}
-        self._ray.wait(self._running, num_returns=1, timeout=seconds)
-        ready, self._running = self._ray.wait(self._running, num_returns=len(self._running), timeout=0)
-        return {call: self._outcome(call) for call in ready}
-
-    def _outcome(self, call: Any) -> Done:
-        errors = self._ray.exceptions
-        try:
-            return Done(self._ray.get(call))
-        except errors.RayTaskError as error:
-            return Done(error=error.cause if isinstance(error.cause, InputError) else error)
-        except errors.RayError as error:
-            return Done(lost=f"its worker or its node was lost ({type(error).__name__})")
+        call = self._call.remote(version("mcdenoise"), function, *arguments)
+        self._calls = {future: each for future, each in self._calls.items() if not future.done()}
+        future: Future[Outcome] = call.future()
+        self._calls[future] = call
+        return future
 
     def close(self) -> None:
         """See :class:`Engine`."""
-        for call in self._running:
-            self._ray.cancel(call, force=True)
-        self._running = []
+        for future, call in self._calls.items():
+            if not future.done():
+                self._ray.cancel(call, force=True)
+        self._calls = {}
         if self._begun:
             self._ray.shutdown()
             self._begun = False
-
-
-def _call(driver: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """In a worker: run a call, if it is of the same version as the driver."""
-    if driver != version("mcdenoise"):
-        raise InputError(
-            f"mcdenoise: expected version {driver}, as the driver has, found {version('mcdenoise')} on "
-            f"{platform.node()}; install the same version on all machines"
-        )
-    return function(*arguments)

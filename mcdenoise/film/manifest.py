@@ -6,11 +6,12 @@ import difflib
 import glob
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
+
+import msgspec
 
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.errors import InputError, is_unicode, printable
@@ -24,7 +25,6 @@ _TAKEN = {"film.json", "film.html", PICTURES}
 _OWN = ("name", "input")
 _LONGEST_NAME = 200
 _LIMIT = 2**63
-_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text", Path: "a path"}
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,12 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
             near = difflib.get_close_matches(name, [*kinds, *_OWN], 1)
             meant = f"did you mean '{near[0]}'?" if near else "see `mcdenoise denoise --help`"
             raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{key}'; {meant}")
-        changed[name] = _typed(kinds[name], value, f"{where}, {key}")
+        try:
+            changed[name] = _typed(kinds[name], value)
+        except ValueError as error:
+            raise InputError(
+                f"{where}, {key}: {error}, found {_found(value)}; see `mcdenoise denoise --help`"
+            ) from error
         if name == "model":
             check_names_no_code(value, f"{where}, {key}")
     made = _absolute(replace(settings, **changed), base, changed)
@@ -168,28 +173,14 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
     return made
 
 
-def _typed(kind: Any, value: Any, where: str) -> Any:
+def _typed(kind: Any, value: Any) -> Any:
     """Convert a value of TOML to the type of a setting."""
-    # TOML has no null: a setting that is None is not in the table.
-    if NoneType in get_args(kind):
-        (kind,) = (each for each in get_args(kind) if each is not NoneType)
-    make: Callable[[Any], Any] = kind
-    if get_origin(kind) is Literal:
-        fits, expected, make = value in get_args(kind), f"one of {', '.join(get_args(kind))}", str
-    elif get_origin(kind) is tuple:
-        value = [value] if isinstance(value, str) else value
-        fits = isinstance(value, list) and all(isinstance(each, str) for each in value)
-        expected, make = "a text or a list of texts", tuple
-    else:
-        # In Python, True and False are integers.
-        fits = isinstance(value, bool) is (kind is bool)
-        fits = fits and isinstance(value, (int, float) if kind is float else str if kind is Path else kind)
-        # Written so that NaN is out of range.
-        fits = fits and (isinstance(value, str) or abs(value) < _LIMIT)
-        expected = f"{_WORDS[kind]}{' below 2^63' if kind in (int, float) else ''}"
-    if not fits:
-        raise InputError(f"{where}: expected {expected}, found {_found(value)}; change it")
-    return make(value)
+    # Written so that NaN is out of range.
+    if isinstance(value, int | float) and not abs(value) < _LIMIT:
+        raise ValueError("expected a number below 2^63")
+    if kind == tuple[str, ...] and isinstance(value, str):
+        value = [value]
+    return msgspec.convert(value, kind, dec_hook=lambda kind, value: kind(value))
 
 
 def _absolute(settings: ShotSettings, base: Path, chosen: Iterable[str]) -> ShotSettings:

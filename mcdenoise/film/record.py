@@ -12,16 +12,17 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import BinaryIO
 
-from mcdenoise.errors import InputError
-from mcdenoise.light import Repairs
-from mcdenoise.models import FrameReport, Stage
+import msgspec
+
+from mcdenoise.models import FrameReport
+from mcdenoise.reading import read_bytes
 
 # Path, size, time of the last change in nanoseconds; a time of -1 is that of no file.
 Stamp = tuple[str, int, int]
@@ -52,33 +53,6 @@ class FrameRecord:
     alike: bool = False
     change: float | None = None
     at: float = field(default_factory=time.time)
-
-    def line(self) -> str:
-        """The record as one line of JSON, with a checksum of all else at its end."""
-        content = asdict(self)
-        return json.dumps({**content, "seal": digest_text(json.dumps(content))})
-
-    @classmethod
-    def of(cls, line: str) -> FrameRecord | None:
-        """The record of a line; ``None`` if the line is no record, or was damaged or cut off."""
-        try:
-            found: dict[str, Any] = json.loads(line)
-            if found.pop("seal") != digest_text(json.dumps(found)):
-                return None
-            report = found["report"]
-            report["stages"] = {name: Stage(**stage) for name, stage in report["stages"].items()}
-            filled, limited, clamped, negative, gained, place = report["repairs"]
-            report["repairs"] = Repairs(filled, limited, clamped, negative, gained, tuple(place))
-            inputs = tuple((_stamp(stamp), str(digest)) for stamp, digest in found["inputs"])
-            own = {**found, "result": _stamp(found["result"]), "inputs": inputs, "report": FrameReport(**report)}
-            return cls(**own)
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            return None
-
-
-def _stamp(found: Any) -> Stamp:
-    path, size, changed = found
-    return str(path), int(size), int(changed)
 
 
 def stamp(path: Path) -> Stamp:
@@ -126,64 +100,27 @@ def digest_text(*parts: str) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-class Journal:
-    """The records of one attempt at a piece, a line a frame.
+def write_record(journal: BinaryIO, record: FrameRecord) -> None:
+    """Add a record to a journal, which is not buffered, as one line of JSON.
 
-    Each attempt has a journal of its own: a worker that is taken for lost may still write to its own.
+    Each attempt at a piece has a journal of its own: a worker that is taken for lost may still write to its own.
     """
-
-    def __init__(self, path: Path, handle: int) -> None:
-        self.path = path
-        self._handle = handle
-
-    @classmethod
-    @contextmanager
-    def open(cls, path: Path) -> Iterator[Journal]:
-        """Create a journal, and its folder, for the duration of a ``with`` block.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = os.open(path, os.O_CREAT | os.O_WRONLY | os.O_APPEND, 0o666)
-        except OSError as error:
-            raise _refused(path, error.strerror) from error
-        try:
-            yield cls(path, handle)
-        finally:
-            os.close(handle)
-
-    def add(self, record: FrameRecord) -> None:
-        """Add the record of a finished frame.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        # A full disk may have cut off the line before.
-        content = f"\n{record.line()}\n".encode()
-        try:
-            if os.write(self._handle, content) < len(content):
-                raise _refused(self.path, "it is cut off")
-        except OSError as error:
-            raise _refused(self.path, error.strerror) from error
-
-
-def _refused(path: Path, reason: str | None) -> InputError:
-    return InputError(f"{path}: cannot be written ({reason}); check the folder and the free space")
+    # A full disk may have cut off the line before; a record that is cut off is none, and its frame is made again.
+    journal.write(b"\n" + msgspec.json.encode(record) + b"\n")
 
 
 def read_records(folder: Path) -> dict[int, FrameRecord]:
     """The last record of each frame in the journals of a folder, by number."""
+    decode = msgspec.json.Decoder(FrameRecord).decode
     found: dict[int, FrameRecord] = {}
     for path in sorted(folder.glob("*.jsonl")):
-        # A pipe of such a name would be waited for.
-        if not path.is_file():
-            continue
-        with suppress(OSError), path.open(encoding="utf-8", errors="replace") as file:
-            for record in filter(None, map(FrameRecord.of, file)):
-                if record.number not in found or found[record.number].at <= record.at:
-                    found[record.number] = record
+        with suppress(OSError):
+            for line in read_bytes(path).splitlines():
+                # Others are cut off, or damaged.
+                with suppress(ValueError, RecursionError):
+                    record = decode(line)
+                    if record.number not in found or found[record.number].at <= record.at:
+                        found[record.number] = record
     return found
 
 
@@ -198,16 +135,15 @@ class Counter:
     def __init__(self, folder: Path, run: str) -> None:
         self._folder, self._run = folder, run
         self._read: dict[Path, int] = {}
-        self._count = 0
+        self.frames = 0
 
     def count(self) -> int:
         """The number of frames."""
         for path in self._folder.glob(f"{self._run}*.jsonl"):
             with suppress(OSError), path.open("rb") as file:
                 file.seek(self._read.get(path, 0))
-                content = file.read()
                 # A line that is still being written is counted by the next call.
-                whole = content.rfind(b"\n") + 1
-                self._read[path] = self._read.get(path, 0) + whole
-                self._count += sum(line.startswith(b'{"number"') for line in content[:whole].split(b"\n"))
-        return self._count
+                whole, end, _ = file.read().rpartition(b"\n")
+                self._read[path] = self._read.get(path, 0) + len(whole + end)
+                self.frames += sum(line.startswith(b"{") for line in whole.split(b"\n"))
+        return self.frames

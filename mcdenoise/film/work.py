@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 import torch.nn.functional as F
@@ -29,13 +29,13 @@ from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import (
     FrameRecord,
-    Journal,
     Stamp,
     digest_of,
     digest_text,
     read_records,
     stamp,
     stamp_and_digest,
+    write_record,
 )
 from mcdenoise.folder import FrameError, check_apart, new_report, write_frames
 from mcdenoise.heap import keep_heap, return_heap
@@ -200,7 +200,8 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
     left = set(piece.wanted) - Keys(opened).finished(order, piece.wanted).keys()
     failed: dict[int, str] = {}
     try:
-        with Journal.open(order.records / f"{order.run}{secrets.token_hex(8)}.jsonl") as journal:
+        make_folder(order.records)
+        with (order.records / f"{order.run}{secrets.token_hex(8)}.jsonl").open("ab", buffering=0) as journal:
             # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
             for part in cut(piece.numbers, left, 0, opened.overlap):
                 numbers, keys = list(part.numbers), Keys(opened)
@@ -219,7 +220,7 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
 class _Writer:
     """Denoises frames, and records each as it is finished."""
 
-    def __init__(self, order: Order, keys: Keys, journal: Journal, left: set[int]) -> None:
+    def __init__(self, order: Order, keys: Keys, journal: BinaryIO, left: set[int]) -> None:
         self.order, self.keys, self.journal, self.left = order, keys, journal, left
         self.opened = keys.opened
         self.report = new_report(self.opened.sequence, "")
@@ -257,7 +258,7 @@ class _Writer:
             number in self.report.alike,
             None if before is None else _difference(self.small, before),
         )
-        self.journal.add(record)
+        write_record(self.journal, record)
         self.left.discard(number)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Hashable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 from calls import die_at_first, fail, fail_strangely, mark
 
 from mcdenoise import engines
-from mcdenoise.engines import MOST_LOSSES, Done, Engine, LocalEngine, RayEngine, Task, open_engine, run_tasks
+from mcdenoise.engines import MOST_LOSSES, Engine, LocalEngine, RayEngine, Task, open_engine, run_tasks
 from mcdenoise.errors import InputError
 
 
@@ -62,7 +61,7 @@ def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> Non
     advances = {"progress": lambda: len(list(tmp_path.glob("advancing.try*")))}
     run.add("advancing", die_at_first, tmp_path, "advancing", MOST_LOSSES + 1, **advances)
     run.on(LocalEngine(2))
-    assert run.failed.pop("hopeless").endswith(f"{MOST_LOSSES} times in a row")
+    assert f"{MOST_LOSSES} times" in run.failed.pop("hopeless")
     assert run.failed == {"failing": "RuntimeError: two lines", "strange": "Strange: 7 and 8", "exits": "SystemExit: 0"}
     assert set(run.answers) == {"quiet", "lost", "advancing"}
     assert set(follow.answers) == {"next"}
@@ -80,9 +79,8 @@ def test_workers_are_a_number_or_a_cluster(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_driver_of_another_version_is_refused() -> None:
-    assert engines._call(version("mcdenoise"), len, "four") == 4
-    with pytest.raises(InputError, match=r"9\.9"):
-        engines._call("9.9", len, "four")
+    assert engines._call(version("mcdenoise"), len, "four") == (4, None)
+    assert "9.9" in str(engines._call("9.9", len, "four"))
 
 
 def kill_children() -> int:
@@ -97,20 +95,16 @@ def kill_children() -> int:
 @pytest.mark.filterwarnings("ignore:resource_tracker")
 def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
     killed: list[int] = []
-
-    class Attacked(LocalEngine):
-        """While workers start, after they have started, and while they wait for a task."""
-
-        def finished(self, seconds: float) -> dict[Hashable, Done]:
-            if len(killed) < 3:
-                found = super().finished(0.0 if not killed else 10.0)
-                killed.append(kill_children())
-                return found
-            return super().finished(seconds)
-
     run, names = Run(), [f"{number}" for number in range(6)]
     for name in names:
         run.add(name, mark, tmp_path, name)
-    assert run.on(Attacked(2)).failed == {}
+
+    def attack() -> None:
+        """While workers start, after they have started, and while they wait for a task."""
+        if len(killed) < 3 and (not killed or len(run.answers) >= len(killed)):
+            killed.append(kill_children())
+
+    run_tasks(LocalEngine(2), run.tasks, attack)
+    assert run.failed == {}
     assert min(killed) >= 1
     assert sorted(path.name for path in tmp_path.iterdir()) == names

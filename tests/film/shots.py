@@ -1,6 +1,7 @@
 """Small shots, that a camera walks past a wall in, films of them, and an engine that makes films in this process."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.engines import Done
+from mcdenoise.engines import Outcome, describe_error
 from mcdenoise.film import work
 from mcdenoise.frame import Frame
 
@@ -18,29 +19,26 @@ from mcdenoise.frame import Frame
 class Inline:
     """An engine that does every task at once, in this process, and loses those that ``lose`` selects."""
 
+    lost = (BrokenExecutor,)
+
     def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
-        self.done: dict[Hashable, Done] = {}
         self.tasks: list[str] = []
         self.lose = lose
 
-    def free_slots(self) -> int:
+    def slots(self) -> int:
         return 1
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Hashable:
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
         self.tasks.append(function.__name__)
-        handle = len(self.tasks)
-        if self.lose(function.__name__, handle):
-            self.done[handle] = Done(lost="its process ended without a word")
-            return handle
+        done: Future[Outcome] = Future()
+        if self.lose(function.__name__, len(self.tasks)):
+            done.set_exception(BrokenExecutor())
+            return done
         try:
-            self.done[handle] = Done(function(*arguments))
+            done.set_result((function(*arguments), None))
         except Exception as error:
-            self.done[handle] = Done(error=error)
-        return handle
-
-    def finished(self, seconds: float) -> dict[Hashable, Done]:
-        found, self.done = self.done, {}
-        return found
+            done.set_result((None, describe_error(error)))
+        return done
 
     def close(self) -> None:
         work.open_order.cache_clear()
