@@ -31,6 +31,8 @@ FRAMES = 10
 SIZE = (320, 180)
 REFERENCE_SPP = 64
 REFERENCE_FRAMES = (8, 9)
+# Frames whose pictures are in the report, which stays below 8 MB.
+_PICTURES = 6
 # Open Image Denoise in the setting that has the smallest errors on sequences, see docs/results.md.
 PEER = "oidn(quality=high, auxiliary=clean, source=accumulated after)"
 # Beside the baselines and the chosen model: a filter of each kind, Open Image Denoise, and models with shipped weights.
@@ -124,7 +126,7 @@ def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tupl
     settings = Settings(
         rounds=1,
         threads=threads,
-        pictures=FRAMES,
+        pictures=_PICTURES,
         on_the_way=True,
         memory=False,
         command=f"mcdenoise demo -o {shlex.quote(str(out))} --model {shlex.quote(model)}",

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
@@ -18,11 +19,8 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLoc
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.labels import nearest, place_labels
 from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
 from mcdenoise.results import STAGES, Cost, Method, Results
-
-Layout = Literal["wide", "narrow"]
 
 # Okabe and Ito 2008, told apart with every kind of colour blindness; behind them four more, for ten models.
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f4fc9", "#8a4b20", "#6b8e00", "#c2185b")
@@ -34,13 +32,12 @@ _VARIABLES = {_INK: "ink", _MUTED: "muted", _RULE: "rule", _PAPER: "paper", _BAS
 _VARIABLES |= {color: f"hue-{index}" for index, color in enumerate(_COLORS)}
 _VARIABLES |= {_STAGES["read"]: "stage-read", _STAGES["write"]: "stage-write"}
 _MARKERS = {"trainable": "o", "fixed": "s", "baseline": "D"}
-_SIZES = {"wide": (10.4, 5.6), "narrow": (4.9, 4.9)}
-# Room for the names beside the last points of the cost plot, as a fraction of the axis.
-_ROOM = {"wide": 0.5, "narrow": 0.04}
+# Inches: in the page it is shown at a width at which its text has about the size of other text.
+_WIDTH, _HEIGHT = 6.4, 4.4
 # Room for the labels of the vertical ticks, in points.
 _TICK_ROOM = 46.0
-# A label farther than this from its point, in points, is tied to it by a line.
-_LEADER = 10.0
+# From a point to its number, in points.
+_CORNERS, _SIDES = ((8, 8), (8, -8), (-8, 8), (-8, -8)), ((11, 0), (-11, 0))
 _STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": _MUTED,
@@ -100,22 +97,19 @@ def stage_colors() -> dict[str, str]:
     return {stage: css_color(color) for stage, color in _STAGES.items()}
 
 
-def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Layout = "wide") -> Figure:
+def error_over_time(view: View, metric: str, colors: dict[str, str]) -> Figure:
     """Error of each method over its milliseconds a frame, with quartiles and the Pareto front.
 
     Args:
         view: the methods.
         metric: name in :data:`mcdenoise.evaluate.METRICS`.
         colors: of :func:`model_colors`.
-        layout: ``"narrow"`` has the methods' numbers for labels.
     """
-    figure, axes = _figure(layout)
     higher = METRICS[metric].higher_is_better
+    figure, axes = _figure(f"{metric} ({'higher' if higher else 'lower'} is better)")
     shown = points(view, metric)
     idle = [row for row in view.rows if row.milliseconds and row.milliseconds.value == 0 and metric in row.errors]
     axes.set_xlabel("milliseconds a frame, without reading and writing files")
-    better = "higher" if higher else "lower"
-    axes.set_title(f"{metric} ({better} is better)", loc="left", fontsize=9.5, color=_INK)
     if not shown:
         return _empty(axes)
     _log_axis(axes, "x", [point.milliseconds for point in shown])
@@ -129,23 +123,17 @@ def error_over_time(view: View, metric: str, colors: dict[str, str], layout: Lay
         color = colors[point.row.method.model]
         for start, end in _bars(point):
             axes.plot(*zip(start, end, strict=True), color=color, linewidth=1.1, alpha=0.65, zorder=3)
-        _mark(axes, point.row.method, point.milliseconds.value, point.error.value, color)
+        _mark(axes, point.row.method, point.row.number, point.milliseconds.value, point.error.value, color)
     _draw_idle(axes, idle, metric)
-    _label(
-        axes,
-        [(point.milliseconds.value, point.error.value) for point in shown],
-        [_name(point.row, layout) for point in shown],
-        bars=[bar for point in shown for bar in _bars(point)],
-        bold=set(front),
-    )
+    places = {point.row.number: (point.milliseconds.value, point.error.value) for point in shown}
+    _write_numbers(axes, places, _CORNERS, bold={shown[index].row.number for index in front})
     return figure
 
 
-def stage_bars(view: View, layout: Layout = "wide") -> Figure:
+def stage_bars(view: View) -> Figure:
     """How the median time of each method divides into stages, files included."""
     rows = [row for row in view.rows if row.stages]
-    width = _SIZES[layout][0]
-    axes = _axes(width, 0.75 + 0.44 * max(len(rows), 1), left=6)
+    axes = _axes(0.75 + 0.44 * max(len(rows), 1), left=6)
     axes.grid(axis="x")
     axes.spines["left"].set_visible(False)
     axes.yaxis.set_major_locator(NullLocator())
@@ -158,87 +146,67 @@ def stage_bars(view: View, layout: Layout = "wide") -> Figure:
             axes.barh(-place, time.value, left=left, height=0.36, color=_STAGES[stage], edgecolor=_PAPER, linewidth=0.4)
             left += time.value
         axes.text(0, -place + 0.24, row.method.name, fontsize=9, va="bottom")
-        axes.annotate(
-            _three_digits(left),
-            (left, -place),
-            (4, 0),
-            textcoords="offset points",
-            fontsize=8.5,
-            va="center",
-            color=_MUTED,
-        )
+        about: Any = {"textcoords": "offset points", "fontsize": 8.5, "va": "center", "color": _MUTED}
+        axes.annotate(f"{left:.0f}" if left >= 100 else f"{left:.3g}", (left, -place), (4, 0), **about)
     axes.set_ylim(-len(rows) + 0.6, 0.85)
     axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
     return _figure_of(axes)
 
 
-def cost_over_pixels(results: Results, colors: dict[str, str], layout: Layout = "wide") -> Figure:
+def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
     """Milliseconds over megapixels: medians with quartiles, and the lines fitted to them."""
-    figure, axes = _figure(layout)
+    figure, axes = _figure("milliseconds a frame, without files")
     axes.set_xlabel("megapixels a frame")
-    axes.set_title("milliseconds a frame, without files", loc="left", fontsize=9.5, color=_INK)
-    measured = [cost for cost in results.costs if cost.milliseconds is not None]
+    measured = [(cost, cost.milliseconds) for cost in results.costs if cost.milliseconds is not None]
     if not measured:
         return _empty(axes)
-    _log_axis(axes, "x", [Range(*[_megapixels(cost)] * 3) for cost in measured])
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high * (high / low) ** _ROOM[layout])
-    spreads = [cost.milliseconds for cost in measured if cost.milliseconds is not None]
-    _log_axis(axes, "y", [Range(spread.median, spread.lower, spread.upper) for spread in spreads])
+    _log_axis(axes, "x", [Range(*[_megapixels(cost)] * 3) for cost, _ in measured])
+    _log_axis(axes, "y", [Range(spread.median, spread.lower, spread.upper) for _, spread in measured])
     fits = {fit.method: fit for fit in results.fits}
-    anchors, names = [], []
+    ends = {}
     for number, method in enumerate(results.methods, start=1):
-        own = sorted((cost for cost in measured if cost.method == method.name), key=_megapixels)
+        own = sorted((_megapixels(cost), spread) for cost, spread in measured if cost.method == method.name)
         if not own:
             continue
         color = colors[method.model]
-        pixels = [_megapixels(cost) for cost in own]
         if method.name in fits:
             fit = fits[method.name]
-            steps = [pixels[0] * (pixels[-1] / pixels[0]) ** (step / 32) for step in range(33)]
+            steps = np.geomspace(own[0][0], own[-1][0], 33).tolist()
             line = [(x, fit.fixed + fit.per_megapixel * x) for x in steps]
             # A fit with a negative fixed part has no logarithm near zero.
             line = [(x, y) for x, y in line if y > 0]
             axes.plot(*zip(*line, strict=True), color=color, linewidth=1.2, zorder=2)
-        for cost, x in zip(own, pixels, strict=True):
-            if cost.milliseconds is not None:
-                axes.plot([x, x], [cost.milliseconds.lower, cost.milliseconds.upper], color=color, linewidth=1.1)
-                _mark(axes, method, x, cost.milliseconds.median, color)
-        if own[-1].milliseconds is not None:
-            anchors.append((pixels[-1], own[-1].milliseconds.median))
-            names.append(method.name if layout == "wide" else str(number))
-    _label(axes, anchors, names, right=True)
+        for x, spread in own:
+            axes.plot([x, x], [spread.lower, spread.upper], color=color, linewidth=1.1)
+            _mark(axes, method, number if x == own[0][0] else 0, x, spread.median, color)
+        ends[number] = own[-1][0], own[-1][1].median
+    _write_numbers(axes, ends, _SIDES)
     return figure
 
 
-def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str, layout: Layout = "wide") -> Figure:
-    """Error over samples a pixel; a curve each, the name at its end.
+def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str) -> Figure:
+    """Error over samples a pixel; a curve each.
 
     Args:
         curves: by name, samples and error, at least one point each; the input is the one called ``input``.
         title: name of the error.
-        layout: layout of the figure.
     """
-    figure, axes = _figure(layout)
+    figure, axes = _figure(title)
     axes.set_xlabel("samples a pixel")
-    axes.set_title(title, loc="left", fontsize=9.5, color=_INK)
     everything = [point for own in curves.values() for point in own]
     if not everything:
         return _empty(axes)
     _log_axis(axes, "x", [Range(*[float(samples)] * 3) for samples, _ in everything])
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high * (high / low) ** 0.3)
     _log_axis(axes, "y", [Range(*[value] * 3) for _, value in everything])
     colors = iter(_COLORS * (1 + len(curves) // len(_COLORS)))
     for name, own in curves.items():
         color = _BASELINE if name == "input" else next(colors)
-        axes.plot(*zip(*own, strict=True), color=color, linewidth=1.4, marker="o", markersize=4)
-    _label(axes, [own[-1] for own in curves.values()], list(curves), right=True)
+        axes.plot(*zip(*own, strict=True), color=color, linewidth=1.4, marker="o", markersize=4, label=name)
     return figure
 
 
 def write_figure(figure: Figure, path: Path) -> None:
-    """Write a figure on white, for papers, as its ending says.
+    """Write a figure on white, for papers, as its ending says, with a legend of its numbers and colours.
 
     Raises:
         InputError: the ending is unknown, or the file cannot be written.
@@ -246,9 +214,12 @@ def write_figure(figure: Figure, path: Path) -> None:
     kind = path.suffix.removeprefix(".")
     if kind not in figure.canvas.get_supported_filetypes():
         raise InputError(f"{path}: expected a figure's ending such as .svg, .png or .pdf, found '{path.suffix}'")
+    axes = figure.axes[0]
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     with atomic_path(path) as temporary:
         metadata = {"Date": None} if kind == "svg" else None
-        figure.savefig(temporary, format=kind, dpi=220, facecolor="white", metadata=metadata)
+        figure.savefig(temporary, format=kind, dpi=220, facecolor="white", metadata=metadata, bbox_inches="tight")
 
 
 def inline_svg(figure: Figure, name: str, description: str) -> str:
@@ -294,20 +265,21 @@ def ticks(low: float, high: float) -> list[float]:
     return [float(f"{value:.6g}") for value in values if low <= value <= high]
 
 
-def _figure(layout: Layout) -> tuple[Figure, Axes]:
-    axes = _axes(*_SIZES[layout], left=_TICK_ROOM)
+def _figure(title: str) -> tuple[Figure, Axes]:
+    axes = _axes(_HEIGHT, left=_TICK_ROOM)
     axes.grid(True)
     axes.tick_params(length=3)
+    axes.set_title(title, loc="left", fontsize=9.5, color=_INK)
     return _figure_of(axes), axes
 
 
-def _axes(width: float, height: float, *, left: float) -> Axes:
+def _axes(height: float, *, left: float) -> Axes:
     """Axes in a new figure, inches; ``left`` is the room for the ticks' labels in points.
 
     Margins are fixed, because finding them takes longer than everything else, and there are many plots.
     """
-    figure = Figure(figsize=(width, height))
-    across, up = 1 / (72 * width), 1 / (72 * height)
+    figure = Figure(figsize=(_WIDTH, height))
+    across, up = 1 / (72 * _WIDTH), 1 / (72 * height)
     figure.subplots_adjust(left=left * across, right=1 - 6 * across, bottom=36 * up, top=1 - 22 * up)
     return figure.add_subplot()
 
@@ -327,8 +299,7 @@ def _log_axis(axes: Axes, which: Literal["x", "y"], ranges: Sequence[Range]) -> 
     positive = [value for one in ranges for value in (one.value, one.lower, one.upper) if value > 0]
     low, high = min(positive), max(positive)
     margin = max((high / low) ** 0.06, 1.06)
-    # Labels stand to the right of their points more often than not.
-    low, high = low / margin, high * (margin**2.2 if which == "x" else margin)
+    low, high = low / margin, high * margin
     axis = axes.xaxis if which == "x" else axes.yaxis
     (axes.set_xscale if which == "x" else axes.set_yscale)("log")
     (axes.set_xlim if which == "x" else axes.set_ylim)(low, high)
@@ -352,9 +323,10 @@ def _bars(point: Point) -> Iterator[tuple[tuple[float, float], tuple[float, floa
     yield (x.value, y.lower), (x.value, y.upper)
 
 
-def _mark(axes: Axes, method: Method, x: float, y: float, color: str) -> None:
-    marker = _MARKERS[method.kind]
-    axes.plot(x, y, marker, color=color, markersize=6.5, markeredgecolor=_PAPER, markeredgewidth=0.8, zorder=4)
+def _mark(axes: Axes, method: Method, number: int, x: float, y: float, color: str) -> None:
+    """Draw a point; one with a number stands in the legend."""
+    about: Any = {"markersize": 6.5, "markeredgecolor": _PAPER, "markeredgewidth": 0.8, "zorder": 4}
+    axes.plot(x, y, _MARKERS[method.kind], color=color, label=f"{number}  {method.name}" if number else None, **about)
 
 
 def _draw_front(axes: Axes, front: Sequence[tuple[float, float]]) -> None:
@@ -387,58 +359,27 @@ def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
             )
 
 
-def _label(
+def _write_numbers(
     axes: Axes,
-    anchors: Sequence[tuple[float, float]],
-    names: Sequence[str],
-    *,
-    bars: Sequence[tuple[tuple[float, float], tuple[float, float]]] = (),
+    places: Mapping[int, tuple[float, float]],
+    around: Sequence[tuple[float, float]],
     bold: Collection[int] = (),
-    right: bool = False,
 ) -> None:
-    """Write each name beside its point; ``right`` keeps them to the right of the leftmost point."""
-    figure = _figure_of(axes)
-    ground = {"facecolor": _PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
-    texts = [
-        axes.text(0, 0, name, fontsize=9, fontweight="bold" if index in bold else "normal", bbox=ground, zorder=5)
-        for index, name in enumerate(names)
-    ]
-    extents = [text.get_window_extent() for text in texts]
-    to_pixels, to_data = axes.transData.transform, axes.transData.inverted().transform
-    places = [_pair(to_pixels(anchor)) for anchor in anchors]
-    frame = axes.get_window_extent()
-    left = min((x for x, _ in places), default=frame.x0) + 4 if right else frame.x0
-    obstacles = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
-    for start, end in bars:
-        (x0, y0), (x1, y1) = _pair(to_pixels(start)), _pair(to_pixels(end))
-        obstacles.append((x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
-    sizes = [(extent.width + 3, extent.height) for extent in extents]
-    boxes = place_labels(places, sizes, (left, frame.y0, figure.bbox.x1, frame.y1), obstacles)
-    for text, box, place in zip(texts, boxes, places, strict=True):
-        text.set_position(_pair(to_data(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2))))
-        text.set_horizontalalignment("center")
-        text.set_verticalalignment("center")
-        end = nearest(box, place)
-        if math.dist(end, place) > _LEADER:
-            line = zip(_pair(to_data(place)), _pair(to_data(end)), strict=True)
-            axes.plot(*line, color=_MUTED, linewidth=0.5, zorder=2.5, clip_on=False)
-
-
-def _pair(values: Any) -> tuple[float, float]:
-    x, y = values
-    return float(x), float(y)
-
-
-def _name(row: Row, layout: Layout) -> str:
-    return row.method.name if layout == "wide" else str(row.number)
+    """Write each number beside its point, at that offset in points where it is farthest from all others."""
+    taken = [tuple(place) for place in axes.transData.transform(list(places.values()))]
+    for number, (x, y) in zip(places, list(taken), strict=True):
+        free = max(
+            ((x + across, y + up) for across, up in around),
+            key=lambda place: min(math.dist(place, other) for other in taken),
+        )
+        taken.append(free)
+        weight: Any = "bold" if number in bold else "normal"
+        place = axes.transData.inverted().transform(free)
+        axes.text(*place, f"{number}", fontsize=9, fontweight=weight, ha="center", va="center", zorder=5)
 
 
 def _megapixels(cost: Cost) -> float:
     return cost.width * cost.height / 1e6
-
-
-def _three_digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def _attribute(text: str) -> str:

@@ -180,7 +180,7 @@ def render_page(template: str, content: dict[str, Any]) -> str:
 
 
 def _write_plots(folder: Path, results: Results, shown: list[View], names: list[str]) -> dict[str, Any]:
-    """Plots as files, and for the page each in a wide and a narrow layout."""
+    """Plots as files, and for the page."""
     from mcdenoise.report import plots
 
     target = folder / PLOTS
@@ -194,33 +194,26 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
     errors: list[dict[str, Any]] = []
     stages: list[dict[str, Any]] = []
 
-    def both(name: str, description: str, wide: Any, narrow: Any) -> dict[str, str]:
-        made = {
-            "wide": plots.inline_svg(wide, f"{name}-wide", description),
-            "narrow": plots.inline_svg(narrow, f"{name}-narrow", description),
-        }
+    def made(name: str, description: str, figure: Any) -> str:
+        inline = plots.inline_svg(figure, name, description)
         for suffix in ("svg", "png"):
-            plots.write_figure(wide, target / f"{name}.{suffix}")
-        return made
+            plots.write_figure(figure, target / f"{name}.{suffix}")
+        return inline
 
     with plots.plot_style():
         for place, view in enumerate(shown):
             suffix = _file_name(view.name, place)
             for metric in names:
                 described = f"{metric} over milliseconds a frame, {view.name}; the table below has the figures"
-                wide, narrow = (plots.error_over_time(view, metric, colors, layout) for layout in ("wide", "narrow"))
-                made = both(f"{metric.lower()}-{suffix}", described, wide, narrow)
-                errors.append(
-                    {"view": place, "metric": metric, "front": [row.method.name for row in front(view, metric)], **made}
-                )
-            if not any(row.stages for row in view.rows):
-                continue
-            described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
-            made = both(f"stages-{suffix}", described, plots.stage_bars(view), plots.stage_bars(view, "narrow"))
-            stages.append({"view": place, **made})
+                figure = plots.error_over_time(view, metric, colors)
+                best = [row.method.name for row in front(view, metric)]
+                plot = made(f"{metric.lower()}-{suffix}", described, figure)
+                errors.append({"view": place, "metric": metric, "front": best, "plot": plot})
+            if any(row.stages for row in view.rows):
+                described = f"Milliseconds of each stage, {view.name}; the table below has the figures"
+                stages.append({"view": place, "plot": made(f"stages-{suffix}", described, plots.stage_bars(view))})
         described = "Milliseconds a frame over megapixels; the table below has the figures"
-        wide, narrow = (plots.cost_over_pixels(results, colors, layout) for layout in ("wide", "narrow"))
-        cost = both("cost", described, wide, narrow) if results.costs else {}
+        cost = made("cost", described, plots.cost_over_pixels(results, colors)) if results.costs else ""
     return {
         "errors": errors,
         "stages": stages,

@@ -185,7 +185,6 @@ def test_a_phone_needs_no_scrolling_sideways(browser: Any, page: Path):
     complaints: list[str] = []
     tab = open_page(browser, page, complaints, viewport={"width": 360, "height": 740})
     assert tab.evaluate("document.documentElement.scrollWidth") == 360
-    assert tab.locator("#plots .plot.narrow:visible").count() == 1
-    assert tab.locator("#plots .plot.wide:visible").count() == 0
+    assert tab.locator("#plots .plot:visible").count() == 1
     tab.close()
     assert not complaints
