@@ -95,6 +95,27 @@ class ShotResult:
         named = [(f"{n[0]}" if len(n) == 1 else f"{n[0]} to {n[-1]} ({len(n)})", why) for n, why in rows]
         return [("all", self.reason), *named] if self.reason else named
 
+    def as_json(self) -> dict[str, Any]:
+        """What ``film.json`` and the page say of the shot."""
+        shot, found, summary = self.shot, self.found, self.summary or Summary()
+        settings = {key: value for key, value in asdict(shot.settings).items() if value not in (None, (), False)}
+        return {
+            "name": shot.name,
+            "input": [str(path) for path in shot.inputs],
+            "settings": {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()},
+            "complete": self.complete,
+            "made": self.made,
+            "failed": [{"frames": frames, "why": why} for frames, why in self.failures()],
+            "frames": list(found.numbers) if found is not None else [],
+            "found_finished": len(found.done) if found is not None else 0,
+            "overlap": found.overlap if found is not None else None,
+            "picked": shot.picked,
+            "milliseconds": summary.milliseconds,
+            "worst": [row["number"] for row in summary.worst],
+            "resets": {str(row["number"]): row["reset"] for row in summary.frames if row["reset"]},
+            "warnings": list(summary.warnings),
+        }
+
 
 @dataclass
 class FilmResult:
@@ -207,7 +228,10 @@ def _run(
                 sweep(folder, youngest=0)
         result.seconds = time.monotonic() - began
         try:
-            write_json(film.out / FILE, _as_json(film, result, created))
+            about = {"created": created, "version": version("mcdenoise"), "complete": result.complete}
+            about |= {"seconds": round(result.seconds, 3), "frames_made": result.made, "piece": film.piece}
+            about |= {"joint_tolerance": film.joint, "shots": [each.as_json() for each in result.shots]}
+            write_json(film.out / FILE, about)
         except InputError as error:
             result.trouble = str(error)
     return result
@@ -275,40 +299,3 @@ class _Shot:
         self.result.reason = reason
         self.on_shot(self.result)
         return []
-
-
-def _as_json(film: Film, result: FilmResult, created: str) -> dict[str, Any]:
-    return {
-        "created": created,
-        "version": version("mcdenoise"),
-        "complete": result.complete,
-        "seconds": round(result.seconds, 3),
-        "frames_made": result.made,
-        "piece": film.piece,
-        "joint_tolerance": film.joint,
-        "shots": [_shot_as_json(each) for each in result.shots],
-    }
-
-
-def _shot_as_json(result: ShotResult) -> dict[str, Any]:
-    shot, found, summary = result.shot, result.found, result.summary
-    settings = {key: value for key, value in asdict(shot.settings).items() if value not in (None, (), False)}
-    about: dict[str, Any] = {
-        "name": shot.name,
-        "input": [str(path) for path in shot.inputs],
-        "settings": {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()},
-        "complete": result.complete,
-        "made": result.made,
-        "failed": [{"frames": frames, "why": why} for frames, why in result.failures()],
-    }
-    if found is not None:
-        about |= {"frames": list(found.numbers), "found_finished": len(found.done)}
-        about |= {"overlap": found.overlap, "picked": shot.picked}
-    if summary is not None:
-        about |= {
-            "milliseconds": summary.milliseconds,
-            "worst": [row["number"] for row in sorted(summary.frames, key=lambda row: -row["score"])[:3]],
-            "resets": {str(row["number"]): row["reset"] for row in summary.frames if row["reset"]},
-            "warnings": list(summary.warnings),
-        }
-    return about

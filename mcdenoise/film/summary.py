@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +31,17 @@ class Summary:
     Args:
         milliseconds: median run time of each stage.
         frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
-        pictures: paths of the thumbnails, by number of the frame, relative to the page.
+        worst: the rows with the highest scores, and ``picture``, the path of a thumbnail relative to the page.
+        strip: number and thumbnail of some other frames across the shot.
         warnings: what is probably wrong, a line each.
         unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
     """
 
-    milliseconds: Mapping[str, float]
-    frames: tuple[Mapping[str, Any], ...]
-    pictures: Mapping[int, str]
-    warnings: tuple[str, ...]
+    milliseconds: Mapping[str, float] = field(default_factory=dict)
+    frames: tuple[Mapping[str, Any], ...] = ()
+    worst: tuple[Mapping[str, Any], ...] = ()
+    strip: tuple[tuple[int, str], ...] = ()
+    warnings: tuple[str, ...] = ()
     unfinished: frozenset[int] = frozenset()
 
 
@@ -64,17 +66,18 @@ def summarize(order: Order) -> Summary:
         write_report(opened.sequence, order.folder, opened.denoiser, report)
         if opened.shot.settings.preview:
             _preview(order, opened, report.files)
-    described = _described(records)
     warnings = list(opened.sequence.warnings)
-    if records:
-        warnings += [*report.warnings, *filter(None, [report.clamped])]
-    return Summary(
-        report.milliseconds if records else {},
-        tuple(described),
-        _pictures(order, records, described),
-        tuple(warnings),
-        unfinished,
-    )
+    if not records:
+        return Summary(warnings=tuple(warnings), unfinished=unfinished)
+    rows = _described(records)
+    worst = sorted(rows, key=lambda row: (-row["score"], row["number"]))[:_WORST]
+    steps = np.linspace(0, len(records) - 1, min(_STRIP, len(records))).round().astype(int)
+    numbers = dict.fromkeys([row["number"] for row in worst] + [records[step].number for step in steps])
+    pictures = _pictures(order, [found[number] for number in numbers])
+    worst = [{**row, "picture": pictures.pop(row["number"])} for row in worst if row["number"] in pictures]
+    warnings += [*report.warnings, *filter(None, [report.clamped])]
+    strip = tuple(sorted(pictures.items()))
+    return Summary(report.milliseconds, tuple(rows), tuple(worst), strip, tuple(warnings), unfinished)
 
 
 def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:
@@ -97,18 +100,11 @@ def _described(records: Collection[FrameRecord]) -> list[dict[str, Any]]:
     return rows
 
 
-def _pictures(order: Order, records: list[FrameRecord], described: list[dict[str, Any]]) -> dict[int, str]:
-    """Write thumbnails of the frames with the highest scores, and of some frames across the shot."""
-    if not records:
-        return {}
-    worst = sorted(described, key=lambda row: (-row["score"], row["number"]))[:_WORST]
-    steps = np.linspace(0, len(records) - 1, min(_STRIP, len(records))).round().astype(int)
-    wanted = {row["number"] for row in worst} | {records[step].number for step in steps}
+def _pictures(order: Order, records: list[FrameRecord]) -> dict[int, str]:
+    """Write thumbnails of frames; their paths, by number of the frame."""
     shown = Preview(order.out / PICTURES / order.shot.name, video=False)
     found = {}
     for record in records:
-        if record.number not in wanted:
-            continue
         try:
             image, metadata = open_result(order.result(record)).read()
         except InputError:
