@@ -121,7 +121,12 @@ def main() -> None:
         for verdict in verdicts(scores, name, family)
         if family in options.sweep
     ]
-    for lines in (notes, [str(verdict) for verdict in against]):
+    told = [
+        f"{v['metric']}: {v['method']} {v['value']:.4g}; {v['family']}'s best single setting {v['single']:.4g} "
+        f"({v['setting']}), its best of each scene {v['best']:.4g}; not better in: {', '.join(v['lost']) or 'none'}"
+        for v in against
+    ]
+    for lines in (notes, told):
         if lines:
             print("\n" + "\n".join(f"- {line}" if options.markdown else line for line in lines))
     if options.json:
@@ -129,7 +134,7 @@ def main() -> None:
             "scores": [asdict(score) for score in scores],
             "folded": [asdict(score) for score in folded(scores, BY)],
             "summary": [asdict(score) for score in means],
-            "verdicts": [asdict(v) | {"ahead": v.ahead, "won": v.won} for v in against],
+            "verdicts": against,
             "reference_noise": {scene.name: scene.reference_noise for scene in results.scenes},
             "noise_floor": floors,
             "flip_every": options.flip_every,

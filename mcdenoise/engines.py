@@ -11,7 +11,7 @@ import itertools
 import multiprocessing
 import os
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -219,15 +219,20 @@ class LocalEngine:
 
     def close(self) -> None:
         """See :class:`Engine`."""
-        processes = [process for pool in self._pools for process in (pool._processes or {}).values()]
-        for pool in self._pools:
-            pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join(_SECONDS_TO_END / len(processes))
-            process.kill()
+        end_pools(self._pools)
         self._pools, self._calls = [], []
+
+
+def end_pools(pools: Sequence[ProcessPoolExecutor], grace: float = _SECONDS_TO_END) -> None:
+    """End the processes of pools, and what they run, at the latest after so many seconds."""
+    processes = [process for pool in pools for process in (pool._processes or {}).values()]
+    for pool in pools:
+        pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join(grace / len(processes))
+        process.kill()
 
 
 def _pool() -> ProcessPoolExecutor:

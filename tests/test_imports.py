@@ -67,7 +67,7 @@ ALLOWED: dict[str, set[str]] = {
     "evaluate": LIBRARY | {"folder"},
     "results": SIGNAL | {"data", "models"},
     "report": LIBRARY | {"evaluate", "results"},
-    "benchmark": LIBRARY | {"check", "commit", "evaluate", "interruption", "methods", "results"},
+    "benchmark": LIBRARY | {"check", "commit", "engines", "evaluate", "interruption", "methods", "results"},
     **dict.fromkeys(TOOLS - REPORTS - {"film"}, LIBRARY | REPORTS | {"commit", "results", "user_cache"}),
     "film": LIBRARY
     | {"commit", "engines", "folder", "heap", "interruption", "methods", "preview", "report", "results", "shot"},

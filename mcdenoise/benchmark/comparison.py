@@ -128,7 +128,9 @@ def summary(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
         row ``MODEL, best of each scene`` follows it: the mean of the best values of each scene.
     """
     scores = list(scores)
-    of_each = {row.family: row for row in _best_of_each_scene(scores)}
+    settings = groupby((score for score in scores if score.family), lambda score: (score.scene, score.family))
+    best = [_best(list(own), f"{family}, best of each scene") for (_, family), own in settings]
+    of_each = {row.family: row for row in mean_over_scenes(best)}
     rows = []
     for row in folded(mean_over_scenes(scores), by):
         rows.append(row)
@@ -137,72 +139,18 @@ def summary(scores: Iterable[Score], by: Collection[str] = ()) -> list[Score]:
     return rows
 
 
-def _best_of_each_scene(scores: Iterable[Score]) -> list[Score]:
-    scores = [score for score in scores if score.family]
-    return mean_over_scenes(
-        _best(list(own), f"{family}, best of each scene")
-        for (_, family), own in groupby(scores, lambda score: (score.scene, score.family))
-    )
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Comparison of a method with a model that has several settings, in one metric.
-
-    Args:
-        metric: name in :data:`METRICS`.
-        method: name of the method.
-        family: the model that has several settings.
-        value: the method's mean over the scenes.
-        single: the model's mean over the scenes with its best single setting.
-        setting: name of that setting.
-        best: the model's mean over the scenes with its best setting for each scene.
-        scenes: for each scene, the method's value and the value of the model's best setting for it.
-    """
-
-    metric: str
-    method: str
-    family: str
-    value: float
-    single: float
-    setting: str
-    best: float
-    scenes: dict[str, tuple[float, float]]
-
-    @property
-    def ahead(self) -> bool:
-        """Whether the method is better than the model's best single setting."""
-        return METRICS[self.metric].better(self.value, self.single)
-
-    @property
-    def won(self) -> list[str]:
-        """Scenes on which the method is better than the model's best setting for that scene."""
-        better = METRICS[self.metric].better
-        return [scene for scene, (value, other) in self.scenes.items() if better(value, other)]
-
-    def __str__(self) -> str:
-        """The verdict in one line; errors are compared by ratio, similarities by difference."""
-        line = (
-            f"{self.metric}: {self.method} {self.value:.4g}; {self.family}'s best single setting {self.single:.4g} "
-            f"({self.setting}): {self._against(self.single)}; its best setting of each scene {self.best:.4g}: "
-            f"{self._against(self.best)}; better in {len(self.won)} of {len(self.scenes)} scenes"
-        )
-        lost = [scene for scene in self.scenes if scene not in self.won]
-        return line + (f", not in {', '.join(lost)}" if lost else "")
-
-    def _against(self, other: float) -> str:
-        if METRICS[self.metric].higher_is_better:
-            return f"{self.value - other:+.4g}"
-        return f"{self.value / other:.3f} times" if other else "no ratio to 0"
-
-
-def verdicts(scores: Iterable[Score], method: str, family: str = "oidn") -> list[Verdict]:
-    """Compare a method with a model that has several settings, metric by metric.
+def verdicts(scores: Iterable[Score], method: str, family: str = "oidn") -> list[dict[str, Any]]:
+    """Compare a method with a model that has several settings: a row for each metric.
 
     Args:
         scores: of :func:`scores_of`.
         method: name of the method.
         family: name of the model.
+
+    Returns:
+        Rows with ``metric``, ``method`` and ``family``; means over the scenes: ``value`` of the method, ``single`` of
+        the model with its best single ``setting``, and ``best`` of the model with its best setting for each scene; and
+        ``lost``, the scenes on which the method is not better than that.
 
     Raises:
         ValueError: the scores do not contain the method or the model.
@@ -214,19 +162,12 @@ def verdicts(scores: Iterable[Score], method: str, family: str = "oidn") -> list
         raise ValueError(f"scores: expected scores of '{method}' and of '{family}', found only one of them")
     (mean,) = mean_over_scenes(ours.values())
     single = _best(mean_over_scenes(theirs), family)
-    (best,) = _best_of_each_scene(theirs)
     by_scene = {name: _best(list(own), family) for name, own in groupby(theirs, lambda score: score.scene)}
-    return [
-        Verdict(
-            metric,
-            method,
-            family,
-            value,
-            single.values[metric],
-            single.chosen[metric],
-            best.values[metric],
-            {name: (score.values[metric], by_scene[name].values[metric]) for name, score in ours.items()},
-        )
-        for metric, value in mean.values.items()
-        if metric in single.values
-    ]
+    (best,) = mean_over_scenes(by_scene.values())
+    rows = []
+    for metric in single.values:
+        value, better = mean.values[metric], METRICS[metric].better
+        lost = [name for name, own in ours.items() if not better(own.values[metric], by_scene[name].values[metric])]
+        row = {"metric": metric, "method": method, "family": family, "value": value, "single": single.values[metric]}
+        rows.append(row | {"setting": single.chosen[metric], "best": best.values[metric], "lost": lost})
+    return rows

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
-import os
-import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
-from contextlib import suppress
-from multiprocessing.connection import Connection
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import torch
 
 from mcdenoise.benchmark.machine import fix_threads
 from mcdenoise.benchmark.methods import make_method
+from mcdenoise.engines import end_pools
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.interruption import deaf_children
+from mcdenoise.interruption import deaf_children, prepare_worker
 from mcdenoise.results import Method
 
 Frames = Callable[[], list[Frame]]
@@ -105,37 +102,15 @@ def peak_memory(make: Make, frames: Frames, *, threads: int, device: str, second
     # The fork server has imported all modules and run nothing, so that a fresh process starts quickly.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send_peak, args=(sender, make, frames, threads), daemon=True)
+    pool = ProcessPoolExecutor(1, context, initializer=prepare_worker)
     try:
         with deaf_children():
-            process.start()
-    except Exception:  # objects that cannot be pickled raise various exceptions
-        return None
-    sender.close()
-    try:
-        return float(receiver.recv()) if receiver.poll(seconds) else None
-    except EOFError:
+            call = pool.submit(_peak_of_this_process, make, frames, threads)
+        return call.result(seconds)
+    except Exception:  # it cannot be pickled, or hangs; the benchmark itself reports an exception of the method
         return None
     finally:
-        process.kill()
-        process.join()
-
-
-def _send_peak(sender: Connection, make: Make, frames: Frames, threads: int) -> None:
-    # On systems where the process could not be started with SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    with suppress(Exception):  # the benchmark itself reports an exception of the method when it denoises
-        sender.send(_peak_of_this_process(make, frames, threads))
-
-
-def _end_with_parent() -> None:
-    # Otherwise a method that hangs would outlive a benchmark that was killed.
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+        end_pools([pool], grace=0)
 
 
 def _peak_of_this_process(make: Make, frames: Frames, threads: int) -> float:

@@ -88,8 +88,7 @@ def measure_sizes(
     """Time every method on synthetic frames of every size, taking turns: A B C, A B C.
 
     The first two frames, of which the second has a history, warm up and are not timed. A method is skipped at a size
-    where it would need more than half of the free memory; the need is extrapolated from images of a half and a quarter
-    of the width and height.
+    where it would need more than half of the free memory: four times what it needs at half of the width and height.
 
     Args:
         methods: methods to time.
@@ -104,15 +103,13 @@ def measure_sizes(
         Milliseconds without reading and writing files, by size and method; and a fitted line for each method that was
         timed at two sizes or more.
     """
-    memory = _Memory(threads, device)
+    peaks = Peaks(threads, device)
     methods = [method for method in methods if method.name in made]
     costs: list[Cost] = []
     for width, height in sizes:
         times: dict[str, list[float]] = {}
-        failures: dict[str, str] = {}
-        for method in methods:
-            if reason := memory.lack(method, width, height):
-                failures[method.name] = reason
+        lacks = {method.name: _lack(peaks, method, width, height, device) for method in methods}
+        failures = {name: reason for name, reason in lacks.items() if reason}
         frame = synthetic_frame(width, height).to(device)
         watch = Stopwatch(device)
         for turn in range(rounds + 2):
@@ -160,32 +157,18 @@ def fit_line(method: str, costs: list[Cost]) -> Fit | None:
     return Fit(method, float(fixed), float(per_megapixel), float(deviation.max()))
 
 
-class _Memory:
-    """Estimates the memory that a method needs."""
-
-    def __init__(self, threads: int, device: str) -> None:
-        self._device, self._peaks = device, Peaks(threads, device)
-
-    def lack(self, method: Method, width: int, height: int) -> str:
-        """Why there is too little memory for an image; ``""`` if there is enough, or if it cannot be estimated."""
-        if width * height <= _SMALL:
-            return ""
-        smaller, small = ((max(width // divisor, 1), max(height // divisor, 1)) for divisor in (4, 2))
-        lower, upper = self._peak(method, smaller), self._peak(method, small)
-        available = available_memory(self._device)
-        if lower is None or upper is None or available is None:
-            return ""
-        pixels, known, less = width * height, small[0] * small[1], smaller[0] * smaller[1]
-        needed = upper + max(upper - lower, 0.0) / (known - less) * (pixels - known)
-        usable = _USABLE_FRACTION * available / 2**20
-        return (
-            ""
-            if needed <= usable
-            else f"too little memory: expected to need {needed:.0f} MiB, found {usable:.0f} MiB that may be used"
-        )
-
-    def _peak(self, method: Method, size: Size) -> float | None:
-        return self._peaks.of(method, size, functools.partial(_two_frames, *size))
+def _lack(peaks: Peaks, method: Method, width: int, height: int, device: str) -> str:
+    """Why there is too little memory for an image; ``""`` if there is enough, or if it cannot be estimated."""
+    if width * height <= _SMALL:
+        return ""
+    half = max(width // 2, 1), max(height // 2, 1)
+    peak, available = peaks.of(method, half, functools.partial(_two_frames, *half)), available_memory(device)
+    if peak is None or available is None:
+        return ""
+    needed, usable = 4 * peak, _USABLE_FRACTION * available / 2**20
+    if needed <= usable:
+        return ""
+    return f"too little memory: expected to need {needed:.0f} MiB, found {usable:.0f} MiB that may be used"
 
 
 def _two_frames(width: int, height: int) -> list[Frame]:

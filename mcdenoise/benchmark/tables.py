@@ -21,11 +21,12 @@ _SHOWN = ("SMAPE", "PSNR", "SSIM", "FLIP")
 
 def write_csv(results: Results, folder: Path) -> None:
     """Write ``results.csv``: a row for each scene and method, including missing methods."""
-    rows = [
-        _row(scene, method, _cell(results, scene, method), results)
-        for scene in results.scenes
-        for method in results.methods
-    ]
+    rows = []
+    for scene in results.scenes:
+        for method in results.methods:
+            cell = results.cell(scene.name, method.name)
+            missing = Cell(scene.name, method.name, failure=f"missing: {method.missing}")
+            rows.append(_row(scene, method, cell or missing, results))
     _write(folder / CSV, rows)
 
 
@@ -73,9 +74,9 @@ def scene_rows(results: Results) -> list[dict[str, str]]:
                     "scene": scene.name,
                     "method": cell.method,
                     **{name: _number(cell.errors.get(name), ".4g") for name in names},
-                    "ms": _number(_median(cell.computing), ".1f"),
-                    "quartiles": "" if cell.computing is None else _range(cell.computing),
-                    "ms with files": _number(_median(cell.whole), ".1f"),
+                    "ms": _number(cell.computing, ".1f"),
+                    "quartiles": _range(cell.computing),
+                    "ms with files": _number(cell.whole, ".1f"),
                     "megapixels/s": _number(results.megapixels_per_second(cell), ".2f"),
                     "peak MiB": _number(cell.memory, ".0f"),
                 }
@@ -121,12 +122,12 @@ def op_rows(results: OpResults) -> list[dict[str, str]]:
             "backend": cost.backend,
             "dtype": cost.dtype,
             "relative error": _number(cost.error, ".1e"),
-            "ms": _number(_median(cost.milliseconds), ".2f"),
-            "quartiles": "" if cost.milliseconds is None else _range(cost.milliseconds),
+            "ms": _number(cost.milliseconds, ".2f"),
+            "quartiles": _range(cost.milliseconds),
             "MiB": _number(cost.mebibytes, ".1f"),
             "copy ms": _number(cost.copy, ".2f"),
             "/ copy": _number(cost.over_copy, ".1f"),
-            "derivatives too, ms": _number(_median(cost.with_derivatives), ".2f"),
+            "derivatives too, ms": _number(cost.with_derivatives, ".2f"),
             "/ their copy": _number(cost.over_copy_with_derivatives, ".1f"),
             "failure": cost.failure,
         }
@@ -134,27 +135,20 @@ def op_rows(results: OpResults) -> list[dict[str, str]]:
     ]
 
 
-def _cell(results: Results, scene: Scene, method: Method) -> Cell:
-    """The cell of a scene and a method; a missing method has a cell with its reason."""
-    found = results.cell(scene.name, method.name)
-    return found or Cell(scene.name, method.name, failure=f"missing: {method.missing}")
-
-
-def _number(value: float | None, form: str) -> str:
+def _number(value: Spread | float | None, form: str) -> str:
+    value = value.median if isinstance(value, Spread) else value
     return "" if value is None else format(value, form)
 
 
-def _range(spread: Spread) -> str:
-    return f"{spread.lower:.1f} to {spread.upper:.1f}"
+def _range(spread: Spread | None) -> str:
+    return "" if spread is None else f"{spread.lower:.1f} to {spread.upper:.1f}"
 
 
 def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str, Any]:
     metrics = dict.fromkeys(name for one in results.cells for name in one.errors)
     errors: dict[str, Any] = {}
     for name in metrics:
-        spread = cell.errors_spread.get(name)
-        errors[name] = cell.errors.get(name)
-        errors |= _quartiles(name, spread)
+        errors |= _times(name, cell.errors_spread.get(name)) | {name: cell.errors.get(name)}
     return {
         "scene": scene.name,
         "method": method.name,
@@ -170,7 +164,7 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
         **errors,
         **_times("ms", cell.computing),
         **_times("whole ms", cell.whole),
-        **{f"{stage} ms": _median(cell.stages.get(stage)) for stage in STAGES},
+        **{f"{stage} ms": cell.stages[stage].median if stage in cell.stages else None for stage in STAGES},
         "megapixels per second": results.megapixels_per_second(cell),
         "peak MiB": cell.memory,
         "failure": cell.failure,
@@ -178,16 +172,8 @@ def _row(scene: Scene, method: Method, cell: Cell, results: Results) -> dict[str
 
 
 def _times(name: str, spread: Spread | None) -> dict[str, float | None]:
-    return {name: _median(spread), **_quartiles(name, spread)}
-
-
-def _median(spread: Spread | None) -> float | None:
-    return None if spread is None else spread.median
-
-
-def _quartiles(name: str, spread: Spread | None) -> dict[str, float | None]:
-    lower, upper = (None, None) if spread is None else (spread.lower, spread.upper)
-    return {f"{name} lower": lower, f"{name} upper": upper}
+    median, lower, upper = (None, None, None) if spread is None else (spread.median, spread.lower, spread.upper)
+    return {name: median, f"{name} lower": lower, f"{name} upper": upper}
 
 
 def _write(path: Path, rows: list[dict[str, Any]]) -> None:
