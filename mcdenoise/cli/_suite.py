@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
 from mcdenoise.benchmark.tables import remarks
-from mcdenoise.cli._output import progress_bar, say, write_json
+from mcdenoise.cli._output import progress_bar, say, steps_of, write_json
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT, EXACT, FILTERED
@@ -18,14 +18,13 @@ from mcdenoise.suite import (
     Progress,
     choose_rows,
     error_against_time,
-    error_lines,
+    lines_of,
     markdown,
     open_row,
     picked_lines,
     render_suite,
     rows_there,
     sample_curves,
-    suite_lines,
     with_peers,
     write_close_ups,
 )
@@ -71,17 +70,10 @@ def score_suite(
     if not found:
         raise InputError(f"{data}: expected frames of the suite, found none; omit --no-render to render them")
     missing = [row.name for row in rows if row not in found]
-    with progress_bar() as progress:
-        task = progress.add_task("score", total=None)
+    with steps_of("score") as on_step:
         shots = [open_row(row, data) for row in found]
-        results = run_benchmark(
-            shots,
-            methods,
-            out,
-            settings,
-            on_step=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    lines, curves = suite_lines(results, found), error_lines(results, found)
+        results = run_benchmark(shots, methods, out, settings, on_step=on_step)
+    lines, curves = lines_of(results, found), lines_of(results, found, curve=True)
     ours = dict.fromkeys(line.model for line in lines)
     names = {line.row for line in lines}
     lines += picked_lines(results, lines, {shot.name: default_model(shot)[0] for shot in shots if shot.name in names})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
@@ -16,7 +16,7 @@ from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_row
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops
 from mcdenoise.cli._options import Json, parse_size
-from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
+from mcdenoise.cli._output import print_rows, say, steps_of, warn, write_json
 from mcdenoise.cli._suite import SHOWN, score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
@@ -94,21 +94,12 @@ def benchmark(
     keep_heap()
     threads = torch.get_num_threads() if threads is None else threads
     check_threads(threads)
+    command = _command_line({name: value for name, value in locals().items() if name != "json"})
     if suite is not None:
         if ops or sequences:
             raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
         if data is None:
             raise InputError("--data: expected the folder of the suite's frames, found none; give one")
-        command = _command_line(
-            "benchmark",
-            suite=suite,
-            data=data,
-            rows=rows,
-            models=models,
-            precisions=precisions,
-            threads=threads,
-            out=out,
-        )
         settings = Settings(
             rounds=1 if rounds is None else rounds,
             threads=threads,
@@ -128,19 +119,16 @@ def benchmark(
         return 0
     rounds = rounds if rounds is not None else 5 if ops else 3
     if ops:
-        with progress_bar() as progress:
-            task = progress.add_task("ops", total=None)
+        with steps_of("ops") as on_step:
             costs = benchmark_ops(
                 size=parse_size(size),
                 rounds=rounds,
                 threads=threads,
                 device=device,
                 out=out,
-                command=_command_line(
-                    "benchmark", "--ops", *sequences, out=out, size=size, rounds=rounds, threads=threads, device=device
-                ),
+                command=command,
                 ops=find_ops([str(name) for name in sequences], OPS) if sequences else OPS,
-                on_step=lambda done, total: progress.update(task, completed=done, total=total),
+                on_step=on_step,
             )
         print_rows(op_rows(costs))
         print(f"a copy moves {costs.bandwidth:.1f} GB/s, reading and writing")
@@ -150,7 +138,6 @@ def benchmark(
         raise InputError("--out: expected a folder to write to, found none; give one with -o")
     if rounds < 1:
         raise InputError(f"--rounds: expected at least 1, found {rounds}")
-    precisions = precisions or "float32,bfloat16"
     settings = Settings(
         rounds=rounds,
         threads=threads,
@@ -159,39 +146,17 @@ def benchmark(
         device=device,
         sizes=tuple(parse_sizes(sizes)),
         pictures=pictures,
-        command=_command_line(
-            "benchmark",
-            *sequences,
-            *(["--keep-all"] if keep_all else []),
-            out=out,
-            models=models,
-            precisions=precisions,
-            frames=frames,
-            rounds=rounds,
-            threads=threads,
-            busy=busy or None,
-            beside=beside or None,
-            device=device,
-            sizes=sizes,
-            pictures=pictures,
-        ),
+        command=command,
     )
     check_packages()
     opened = [open_sequence(sequence, frames) for sequence in sequences]
-    methods = choose_methods(models, precisions=precisions, keep_all=keep_all)
+    methods = choose_methods(models, precisions=precisions or "float32,bfloat16", keep_all=keep_all)
     tried = {
         each.model: Spelling(each.model, None, each.settings) for each in methods if not each.weights + each.missing
     }
     warn(filter(None, (each.doubt for each in tried.values())))
-    with progress_bar() as progress:
-        task = progress.add_task("benchmark", total=None)
-        results = run_benchmark(
-            opened,
-            methods,
-            out,
-            settings,
-            on_step=lambda done, total: progress.update(task, completed=done, total=total),
-        )
+    with steps_of("benchmark") as on_step:
+        results = run_benchmark(opened, methods, out, settings, on_step=on_step)
     print_rows(scene_rows(results))
     print_rows(skipped_rows(results))
     for line in [*remarks(results), f"report: {write_report(out)}"]:
@@ -200,7 +165,13 @@ def benchmark(
     return 1 if results.failed else 0
 
 
-def _command_line(*arguments: object, **options: object) -> str:
+def _command_line(options: dict[str, Any]) -> str:
     """A command line with all options, including those with their default values."""
-    chosen = [f"--{name}={value}" for name, value in options.items() if value is not None]
-    return shlex.join(["mcdenoise", *map(str, arguments), *chosen])
+    words = ["mcdenoise", "benchmark", *map(str, options.pop("sequences"))]
+    for name, value in options.items():
+        option = name.replace("_", "-")
+        if isinstance(value, bool):
+            words += [f"--{option}" if value else f"--no-{option}"] if value is not (name == "render") else []
+        elif value not in (None, ""):
+            words.append(f"--{option}={value}")
+    return shlex.join(words)

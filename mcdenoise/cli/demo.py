@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
-
-from rich.table import Table
 
 from mcdenoise.cli._options import Out
-from mcdenoise.cli._output import print_times, progress_bar, say, show
+from mcdenoise.cli._output import print_rows, print_times, progress_bar, say
 from mcdenoise.demo import FRAMES, run_demo
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT
@@ -36,16 +32,14 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
             on_frame=lambda: progress.advance(denoising),
             on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
         )
-    scores = [asdict(score) for score in result.scores]
-    _print_scores(scores)
+    print_rows(
+        [
+            {"image": score.method}
+            | {name: f"{score.values[name]:.4g}" if name in score.values else "-" for name in result.scores[0].values}
+            | {"frames": str(score.frames)}
+            for score in result.scores
+        ]
+    )
     print_times(result.report.milliseconds)
     for what, path in {"clean frames": result.denoised, "picture": result.picture, "report": result.page}.items():
         say(f"{what}: {path}")
-
-
-def _print_scores(rows: list[dict[str, Any]]) -> None:
-    table = Table("image", *rows[0]["values"], "frames")
-    for row in rows:
-        values = (row["values"].get(name) for name in rows[0]["values"])
-        table.add_row(row["method"], *("-" if x is None else f"{x:.4g}" for x in values), str(row["frames"]))
-    show(table)

@@ -15,7 +15,7 @@ import tyro
 
 from mcdenoise import ops
 from mcdenoise.cli._options import Inputs, Json, Out
-from mcdenoise.cli._output import print_times, progress_bar, say, stages, warn, write_json
+from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_of, warn, write_json
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence, open_sequence
@@ -94,11 +94,8 @@ def _denoise(opened: Sequence, out: Path, shot: ShotSettings, json: Path | None,
     """Denoise a shot to a folder, and print the report; returns the last file, which is called ``shown`` there."""
     preview = shot.preview_in(out, video=len(opened) > 1) if shot.preview else None
     if shot.is_budgeted:
-        with progress_bar() as progress:
-            task = progress.add_task("measure models", total=None)
-            resolved, choice = shot.chosen(
-                opened, lambda done, total: progress.update(task, completed=done, total=total)
-            )
+        with steps_of("measure models") as on_step:
+            resolved, choice = shot.chosen(opened, on_step)
     else:
         resolved, choice = shot.chosen(opened)
     if choice:

@@ -6,12 +6,10 @@ from dataclasses import asdict
 from typing import Literal
 
 import tyro
-from rich.markup import escape
-from rich.table import Table
 
 from mcdenoise.check.gradients import check_case, select
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import progress_bar, show, write_json
+from mcdenoise.cli._output import print_rows, progress_bar, write_json
 
 
 def gradcheck(
@@ -31,16 +29,21 @@ def gradcheck(
         order: 1 to check first derivatives only, for functions that can be differentiated once.
         json: write the results to this file too.
     """
-    table = Table("op", "case", "inputs", "result", "seconds")
     with progress_bar() as progress:
         chosen = progress.track(select(ops or None), description="gradcheck")
         results = [check_case(op, case, order) for op, case in chosen]
-    for result in results:
-        outcome = "ok" if result.passed else f"FAILED {result.message}"
-        row = (result.op, result.case, ", ".join(result.inputs), outcome, f"{result.seconds:.2f}")
-        # Names and messages of other people's code are not markup.
-        table.add_row(*map(escape, row))
-    show(table)
+    print_rows(
+        [
+            {
+                "op": each.op,
+                "case": each.case,
+                "inputs": ", ".join(each.inputs),
+                "result": "ok" if each.passed else f"FAILED {each.message}",
+                "seconds": f"{each.seconds:.2f}",
+            }
+            for each in results
+        ]
+    )
     write_json(json, [asdict(result) for result in results])
     failed = sum(not result.passed for result in results)
     print(f"{len(results)} checks, {failed} failed")

@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from mcdenoise.cli._options import Flag, Json
-from mcdenoise.cli._output import console_of_tables, show, warn, write_json
+from mcdenoise.cli._output import console_of_tables, print_rows, show, warn, write_json
 from mcdenoise.models import ModelOverview, overview, troubles
 
 # In a narrower terminal the descriptions take the place of these columns.
@@ -76,9 +76,16 @@ def _list_ops(json: Json) -> None:
     from mcdenoise.check.overview import overview as overview_of_ops
 
     entries = overview_of_ops()
-    table = Table("op", "description", "differentiable in", "cases", "float32", "bfloat16", "float16")
-    for entry in entries:
-        errors = (f"{entry.errors[name]:.0e}" for name in ("float32", "bfloat16", "float16"))
-        table.add_row(entry.name, entry.summary, ", ".join(entry.differentiable), str(entry.cases), *errors)
-    show(table)
+    print_rows(
+        [
+            {
+                "op": entry.name,
+                "description": entry.summary,
+                "differentiable in": ", ".join(entry.differentiable),
+                "cases": str(entry.cases),
+                **{name: f"{entry.errors[name]:.0e}" for name in ("float32", "bfloat16", "float16")},
+            }
+            for entry in entries
+        ]
+    )
     write_json(json, [asdict(entry) for entry in entries])

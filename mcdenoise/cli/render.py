@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from mcdenoise.cli._options import Flag, Out, Workers, parse_size
-from mcdenoise.cli._output import progress_bar, say
+from mcdenoise.cli._output import say, steps_of
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine, parse_workers
 from mcdenoise.errors import InputError
@@ -95,8 +95,7 @@ def render(
         scene, out = Path(os.path.abspath(scene)), Path(os.path.abspath(out))
         arguments["variant"] = choose_variant(rendering.variant)
         engine = RayEngine(rendering.workers, gpus=float(arguments["variant"].startswith("cuda")))
-    with progress_bar() as progress:
-        task = progress.add_task("render", total=None)
+    with steps_of("render") as on_step:
         written = render_sequence(
             scene,
             shot.cameras[::every],
@@ -108,7 +107,7 @@ def render(
             noise_level=noise_level,
             keep_samples=keep_samples,
             workers=workers or 1,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
+            progress=on_step,
             **arguments,
         )
     say(written)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import tyro
-from rich.markup import escape
-from rich.table import Table
 
 from mcdenoise.check.stability import (
     FRAMES,
@@ -18,7 +16,7 @@ from mcdenoise.check.stability import (
     summarize,
 )
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import progress_bar, show, write_json
+from mcdenoise.cli._output import print_rows, progress_bar, write_json
 from mcdenoise.errors import InputError
 
 
@@ -68,54 +66,55 @@ def stability(
 
 def _print_checks(checks: list[Check]) -> None:
     """Print a row for each subject, dtype and backend: the error that is closest to its bound, and that bound."""
-    if not checks:
-        return
-    rows: dict[tuple[str, str, str], list[Summary]] = {}
+    found: dict[tuple[str, str, str], dict[str, Summary]] = {}
     for summary in summarize(checks):
-        rows.setdefault((summary.subject, summary.dtype, summary.backend), []).append(summary)
-    table = Table("subject", "dtype", "backend", "checks", "condition", "forward", "gradient", "holds", "result")
-    for key, summaries in rows.items():
-        found = {summary.what: summary for summary in summaries}
-        errors = []
+        found.setdefault((summary.subject, summary.dtype, summary.backend), {})[summary.what] = summary
+    rows = []
+    for key, summaries in found.items():
+        row = dict(zip(("subject", "dtype", "backend"), key, strict=True))
+        row["checks"] = str(sum(summary.checks for summary in summaries.values()))
+        row["condition"] = f"{max(summary.condition for summary in summaries.values()):.1g}"
         for what in ("forward", "gradient"):
-            worst = found[what].worst if what in found else None
-            errors.append(f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-")
-        holds = ", ".join(what for what, summary in found.items() if not summary.failed)
-        failed = [check for summary in summaries for check in summary.failed]
-        result = "ok"
-        if failed:
-            result = f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
-        elif list(found) == ["runs"]:
-            holds, result = "-", f"not run: {found['runs'].worst.message}"
-        condition = max(summary.condition for summary in summaries)
-        # Names and messages of other people's code are not markup.
-        row = (*key, str(sum(s.checks for s in summaries)), f"{condition:.1g}", *errors, holds, result)
-        table.add_row(*map(escape, row))
-    show(table)
+            worst = summaries[what].worst if what in summaries else None
+            row[what] = f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-"
+        row["holds"] = ", ".join(what for what, summary in summaries.items() if not summary.failed)
+        row["result"] = "ok"
+        if failed := [check for summary in summaries.values() for check in summary.failed]:
+            row["result"] = f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
+        elif list(summaries) == ["runs"]:
+            row |= {"holds": "-", "result": f"not run: {summaries['runs'].worst.message}"}
+        rows.append(row)
+    print_rows(rows)
 
 
 def _print_shots(checks: list[Check]) -> None:
     """Print a row for each unusual shot: how many denoisers and dtypes had a valid image, and which had none."""
-    rows: dict[str, list[Check]] = {}
+    shots: dict[str, list[Check]] = {}
     for check in checks:
         if check.what == VALID_SHOT:
-            rows.setdefault(check.case, []).append(check)
-    if not rows:
-        return
-    table = Table("shot", "checks", "every image is finite and not negative")
-    for case, found in rows.items():
+            shots.setdefault(check.case, []).append(check)
+    rows = []
+    for case, found in shots.items():
         failed = [f"{check.subject}, {check.dtype}: {check.message}" for check in found if not check.passed]
-        table.add_row(*map(escape, (case, str(len(found)), f"FAILED: {failed[0]}" if failed else "ok")))
-    show(table)
+        result = f"FAILED: {failed[0]}" if failed else "ok"
+        rows.append({"shot": case, "checks": str(len(found)), "every image is finite and not negative": result})
+    print_rows(rows)
 
 
 def _print_long_runs(runs: list[LongRun]) -> None:
-    if not runs:
-        return
-    table = Table("long run", "dtype", "error after frames", "at most", "ghost", "result")
-    for run in runs:
-        over_time = ", ".join(f"{number}: {error:.1g}" for number, error in zip(run.frames, run.errors, strict=True))
-        ghost = "-" if run.ghost is None else f"{run.ghost} frames"
-        allowed = f"{run.allowed:.2g}" if run.allowed else "-"
-        table.add_row(run.name, run.dtype, over_time or "-", allowed, ghost, "ok" if run.passed else run.message)
-    show(table)
+    print_rows(
+        [
+            {
+                "long run": run.name,
+                "dtype": run.dtype,
+                "error after frames": ", ".join(
+                    f"{number}: {error:.1g}" for number, error in zip(run.frames, run.errors, strict=True)
+                )
+                or "-",
+                "at most": f"{run.allowed:.2g}" if run.allowed else "-",
+                "ghost": "-" if run.ghost is None else f"{run.ghost} frames",
+                "result": "ok" if run.passed else run.message,
+            }
+            for run in runs
+        ]
+    )

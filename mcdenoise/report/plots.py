@@ -374,8 +374,8 @@ def _write_numbers(
         )
         taken.append(free)
         weight: Any = "bold" if number in bold else "normal"
-        place = axes.transData.inverted().transform(free)
-        axes.text(*place, f"{number}", fontsize=9, fontweight=weight, ha="center", va="center", zorder=5)
+        across, up = axes.transData.inverted().transform(free)
+        axes.text(across, up, f"{number}", fontsize=9, fontweight=weight, ha="center", va="center", zorder=5)
 
 
 def _megapixels(cost: Cost) -> float:

@@ -8,11 +8,10 @@ from mcdenoise.suite.tables import (
     Line,
     MethodMean,
     error_against_time,
-    error_lines,
+    lines_of,
     markdown,
     picked_lines,
     sample_curves,
-    suite_lines,
     with_peers,
 )
 
@@ -26,14 +25,13 @@ __all__ = [
     "Shot",
     "choose_rows",
     "error_against_time",
-    "error_lines",
+    "lines_of",
     "markdown",
     "open_row",
     "picked_lines",
     "render_suite",
     "rows_there",
     "sample_curves",
-    "suite_lines",
     "with_peers",
     "write_close_ups",
 ]

@@ -8,7 +8,7 @@ from statistics import geometric_mean
 
 from mcdenoise.evaluate import METRICS
 from mcdenoise.methods import split_methods
-from mcdenoise.results import Cell, Method, Results
+from mcdenoise.results import Cell, Results
 from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
@@ -76,14 +76,26 @@ class Line:
         return METRICS[metric].better(self.values[metric], self.best[metric].value)
 
 
-def suite_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """The lines of the table, model by model; a model has no line for a row on which it failed."""
-    return _lines(results, [row for row in rows if not row.shot.curve])
-
-
-def error_lines(results: Results, rows: Iterable[Row]) -> list[Line]:
-    """As :func:`suite_lines`, for the curves of error over samples."""
-    return _lines(results, [row for row in rows if row.shot.curve])
+def lines_of(results: Results, rows: Iterable[Row], *, curve: bool = False) -> list[Line]:
+    """The lines of the table, or of the curves of error over samples, model by model; none where a model failed."""
+    own = [row for row in rows if row.shot.curve is curve]
+    ours = [method for method in results.methods if method.kind != "baseline" and method.model != _PEER]
+    noise = {scene.name: scene.reference_noise for scene in results.scenes}
+    return [
+        Line(
+            row.name,
+            method.name,
+            row.shot.samples,
+            _shown(cell),
+            _best(results, row),
+            _shown(_cell(results, row, "noisy")),
+            _milliseconds(cell),
+            noise[row.name],
+        )
+        for method in ours
+        for row in own
+        if (cell := _cell(results, row, method.name)) is not None
+    ]
 
 
 def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, str]) -> list[Line]:
@@ -91,7 +103,7 @@ def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, st
 
     Args:
         results: of the benchmark.
-        lines: see :func:`suite_lines`.
+        lines: see :func:`lines_of`.
         picks: name of the model by row; other rows are skipped.
 
     Returns:
@@ -110,39 +122,27 @@ def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, st
     return picked
 
 
-def _lines(results: Results, rows: list[Row]) -> list[Line]:
-    ours = [method for method in results.methods if method.kind != "baseline" and method.model != _PEER]
-    peers = [method for method in results.methods if method.model == _PEER]
-    noise = {scene.name: scene.reference_noise for scene in results.scenes}
-    lines = []
-    for method in ours:
-        for row in rows:
-            cell = _cell(results, row, method.name)
-            if cell is None:
-                continue
-            noisy = _cell(results, row, "noisy")
-            lines.append(
-                Line(
-                    row.name,
-                    method.name,
-                    row.shot.samples,
-                    _shown(cell),
-                    _best(results, row, peers),
-                    _shown(noisy) if noisy is not None else {},
-                    _milliseconds(cell),
-                    noise[row.name],
-                )
-            )
-    return lines
-
-
 def _cell(results: Results, row: Row, method: str) -> Cell | None:
     cell = results.cell(row.name, method)
     return None if cell is None or cell.failure else cell
 
 
-def _shown(cell: Cell) -> dict[str, float]:
-    return {name: cell.errors[name] for name in SHOWN if name in cell.errors}
+def _shown(cell: Cell | None) -> dict[str, float]:
+    return {} if cell is None else {name: cell.errors[name] for name in SHOWN if name in cell.errors}
+
+
+def _milliseconds(cell: Cell) -> float | None:
+    return None if cell.computing is None else cell.computing.median
+
+
+def _best(results: Results, row: Row) -> dict[str, Best]:
+    found: dict[str, Best] = {}
+    for method in results.methods:
+        cell = _cell(results, row, method.name) if method.model == _PEER else None
+        for name, value in _shown(cell).items():
+            if cell is not None and (name not in found or METRICS[name].better(value, found[name].value)):
+                found[name] = Best(value, method.name, _milliseconds(cell))
+    return found
 
 
 @dataclass(frozen=True)
@@ -199,26 +199,12 @@ def _point(results: Results, row: Row, method: str) -> tuple[float, float] | Non
     return cell.errors[SMAPE] / noisy.errors[SMAPE], cell.computing.median
 
 
-def _milliseconds(cell: Cell) -> float | None:
-    return None if cell.computing is None else cell.computing.median
-
-
-def _best(results: Results, row: Row, peers: list[Method]) -> dict[str, Best]:
-    found: dict[str, Best] = {}
-    for method in peers:
-        cell = _cell(results, row, method.name)
-        for name, value in ({} if cell is None else _shown(cell)).items():
-            if cell is not None and (name not in found or METRICS[name].better(value, found[name].value)):
-                found[name] = Best(value, method.name, _milliseconds(cell))
-    return found
-
-
 def markdown(lines: list[Line], curves: list[Line], means: Sequence[MethodMean] = (), counted: int = 0) -> str:
     """The tables in Markdown: error against time, one table per model with its wins and losses, error over samples.
 
     Args:
-        lines: see :func:`suite_lines`.
-        curves: see :func:`error_lines`.
+        lines: see :func:`lines_of`.
+        curves: see :func:`lines_of`.
         means: see :func:`error_against_time`.
         counted: number of rows behind ``means``.
     """
@@ -242,9 +228,7 @@ def sample_curves(curves: list[Line]) -> dict[str, dict[str, list[tuple[int, flo
     found: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for line in curves:
         own = found.setdefault(line.row.rpartition("-")[0], {})
-        points = {line.model: line.values, "input": line.noisy}
-        points["OIDN, best"] = {name: best.value for name, best in line.best.items()}
-        for name, values in points.items():
+        for name, values in {line.model: line.values, "input": line.noisy, "OIDN, best": _of_best(line)}.items():
             point = (line.samples, values[SMAPE]) if SMAPE in values else None
             if point is not None and point not in own.setdefault(name, []):
                 own[name].append(point)
@@ -275,6 +259,7 @@ def verdict(lines: list[Line]) -> list[str]:
 
 
 def _table(lines: list[Line]) -> list[str]:
+    columns = ((SMAPE, ".4f"), (PSNR, ".2f"), (TEMPORAL, ".4f"))
     heads = [
         "row",
         "SMAPE",
@@ -289,60 +274,40 @@ def _table(lines: list[Line]) -> list[str]:
         "OIDN's setting",
         "reference",
     ]
-    return _rows(heads, ([line.row, *_figures(line)] for line in lines))
+    rows = []
+    for line in lines:
+        cells = [_number(values.get(name), form) for name, form in columns for values in (line.values, _of_best(line))]
+        smape = line.best.get(SMAPE)
+        cells.insert(2, _number(line.values[SMAPE] / smape.value if smape else None, ".3f"))
+        cells += [_number(line.milliseconds, ".0f"), _number(smape.milliseconds if smape else None, ".0f")]
+        cells += [smape.setting.removeprefix(_PEER) if smape else "", _number(line.reference_noise, ".4f")]
+        rows.append([line.row, *cells])
+    return _rows([*heads, "OIDN's setting", "reference"], rows)
+
+
+def _of_best(line: Line) -> dict[str, float]:
+    return {name: best.value for name, best in line.best.items()}
 
 
 def _means_table(means: Sequence[MethodMean]) -> list[str]:
-    heads = ["method", "SMAPE", "ms", "on the Pareto front"]
-    return _rows(
-        heads,
-        (
-            [
-                mean.method,
-                _number(mean.error, ".4f"),
-                _number(mean.milliseconds, ".0f"),
-                f"no: {mean.beaten_by}" if mean.beaten_by else "yes",
-            ]
-            for mean in means
-        ),
-    )
+    def row(mean: MethodMean) -> list[str]:
+        front = f"no: {mean.beaten_by}" if mean.beaten_by else "yes"
+        return [mean.method, _number(mean.error, ".4f"), _number(mean.milliseconds, ".0f"), front]
 
-
-def _figures(line: Line) -> list[str]:
-    best = line.best
-    smape = best.get(SMAPE)
-    return [
-        _number(line.values.get(SMAPE), ".4f"),
-        _number(smape.value if smape else None, ".4f"),
-        _number(line.values[SMAPE] / smape.value if smape else None, ".3f"),
-        _number(line.values.get(PSNR), ".2f"),
-        _number(best[PSNR].value if PSNR in best else None, ".2f"),
-        _number(line.values.get(TEMPORAL), ".4f"),
-        _number(best[TEMPORAL].value if TEMPORAL in best else None, ".4f"),
-        _number(line.milliseconds, ".0f"),
-        _number(smape.milliseconds if smape else None, ".0f"),
-        smape.setting.removeprefix(_PEER) if smape else "",
-        _number(line.reference_noise, ".4f"),
-    ]
+    return _rows(["method", "SMAPE", "ms", "on the Pareto front"], map(row, means))
 
 
 def _curve_table(curves: list[Line]) -> list[str]:
     models = list(dict.fromkeys(line.model for line in curves))
-    by_row = {(line.row, line.model): line for line in curves}
     heads = ["row", *(f"{what}, {metric}" for metric in ("SMAPE", "PSNR") for what in ("input", *models, "OIDN"))]
-    heads.append("reference")
     rows = []
     for row in dict.fromkeys(line.row for line in curves):
-        any_line = next(line for line in curves if line.row == row)
-        cells = [row]
-        for metric, form in ((SMAPE, ".4f"), (PSNR, ".2f")):
-            cells.append(_number(any_line.noisy.get(metric), form))
-            for model in models:
-                line = by_row.get((row, model))
-                cells.append(_number(line.values.get(metric) if line else None, form))
-            cells.append(_number(any_line.best[metric].value if metric in any_line.best else None, form))
-        rows.append([*cells, _number(any_line.reference_noise, ".4f")])
-    return _rows(heads, rows)
+        own = {line.model: line for line in curves if line.row == row}
+        any_line = next(iter(own.values()))
+        shown = [any_line.noisy, *(own[name].values if name in own else {} for name in models), _of_best(any_line)]
+        cells = [_number(values.get(name), form) for name, form in ((SMAPE, ".4f"), (PSNR, ".2f")) for values in shown]
+        rows.append([row, *cells, _number(any_line.reference_noise, ".4f")])
+    return _rows([*heads, "reference"], rows)
 
 
 def _rows(heads: list[str], rows: Iterable[list[str]]) -> list[str]:

@@ -101,6 +101,7 @@ def test_figures_are_those_of_the_results(folder: Path, outline: Outline):
     cell = Results.read(folder).cell("first", "ours")
     rows = [" ".join(row.split()) for row in outline.rows]
     assert any(row.startswith(f"ours {cell.errors['SMAPE']:.4f} {cell.errors['PSNR']:.2f} 10") for row in rows)
+    assert any("reproject 75%" in row for row in rows)
 
 
 def test_too_many_pictures_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch):

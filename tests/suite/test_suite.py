@@ -19,12 +19,12 @@ from mcdenoise.suite import (
     Shot,
     choose_rows,
     error_against_time,
+    lines_of,
     markdown,
     open_row,
     render_suite,
     rendering,
     rows_there,
-    suite_lines,
 )
 from mcdenoise.suite.close_ups import PARTS, write_close_ups
 from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict
@@ -153,7 +153,7 @@ def _results(ours: list[float], fast: list[float], high: list[float]) -> tuple[R
 
 def test_each_row_is_compared_with_the_best_setting_on_that_row() -> None:
     results, rows = _results([0.1, 0.2], fast=[0.2, 0.15], high=[0.3, 0.1])
-    first, second = suite_lines(results, rows)
+    first, second = lines_of(results, rows)
     assert (first.row, first.model, first.samples, first.reference_noise) == ("a", "ours", 4, 0.01)
     assert (first.best[SMAPE].value, first.best[SMAPE].setting) == (0.2, "oidn(quality=fast)")
     assert (second.best[SMAPE].value, second.best[SMAPE].setting) == (0.1, "oidn(quality=high)")
