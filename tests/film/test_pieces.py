@@ -9,6 +9,7 @@ import torch
 from shots import frame, pixels, write_shot
 from torch.utils import _pytree as pytree
 
+from mcdenoise import ops
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
@@ -72,8 +73,10 @@ def test_a_method_that_keeps_a_state_says_how_long(name: str) -> None:
     if not model.needs.buffers <= frame(0, 32, 32, 0).buffers:
         pytest.skip("the frame has not what it needs")
     denoiser = Denoiser(model)
-    for number in range(2):
-        denoiser(frame(number, 32, 32, 0).replace(motion=torch.zeros(1, 2, 32, 32)))
+    # Compiling kernels would take longer than all else.
+    with ops.use("torch"):
+        for number in range(2):
+            denoiser(frame(number, 32, 32, 0).replace(motion=torch.zeros(1, 2, 32, 32)))
     keeps = [leaf for leaf in pytree.tree_leaves(denoiser._state) if leaf is not None]
     assert bool(keeps) == (remembered != 0)
 
