@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.table import Table
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import progress_bar, say, show, warn, write_json
+from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_method
@@ -71,21 +70,21 @@ def evaluate(
 def _print_evaluation(result: Evaluation) -> None:
     strict = result.tables["strict"]
     for name, own in result.tables.items():
-        columns = []
+        columns = {}
         for metric in own.mean:
-            columns.append((metric, own, "" if own is strict else name))
+            columns[metric if own is strict else f"{metric} {name}"] = own, metric
             # Only these are comparable; a protocol may compute other metrics, such as SMAPE, of displayed values.
             if own is not strict and metric in ("PSNR", "SSIM") and metric in strict.mean:
-                columns.append((metric, strict, "strict"))
-        table = Table("frame", *(f"{metric} {of}".strip() for metric, _, of in columns))
-        for number in own.frames:
-            table.add_row(str(number), *(_figure(of.frames[number].get(metric)) for metric, of, _ in columns))
-        table.add_section()
-        table.add_row("mean", *(_figure(of.mean[metric]) for metric, of, _ in columns))
+                columns[f"{metric} strict"] = strict, metric
+        rows = {
+            str(number): {key: of.frames[number].get(each) for key, (of, each) in columns.items()}
+            for number in own.frames
+        }
+        rows["mean"] = {key: of.mean[each] for key, (of, each) in columns.items()}
         if own is strict and result.floor:
-            table.add_row("perfect", *(_figure(result.floor.get(metric)) for metric, _, _ in columns))
+            rows["perfect"] = {key: result.floor.get(each) for key, (_, each) in columns.items()}
         if columns:
-            show(table)
+            print_rows([{"frame": of} | {key: _figure(x) for key, x in row.items()} for of, row in rows.items()])
         say(f"{name}: {own.description}")
         for reason in dict.fromkeys(own.skipped.values()):
             without = [metric for metric, why in own.skipped.items() if why == reason]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,12 +20,12 @@ Codes = NDArray[np.uint8]
 # Radiance of the largest code; brighter pixels look the same in the page.
 BRIGHTEST = 64.0
 _GAMMA = 2.2
-# Lossless as long as that fits, then ever coarser; chroma is never subsampled, for colours are compared.
-FORMATS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("webp", {"lossless": True, "quality": 40, "method": 2}),
-    ("jpeg", {"quality": 95, "subsampling": 0}),
-    ("jpeg", {"quality": 88, "subsampling": 0}),
-    ("jpeg", {"quality": 75, "subsampling": 0}),
+# For pictures of at most so many pixels together: lossless if they are few, then ever coarser, so that they take some
+# 20 megabytes at most. Chroma is never subsampled, for colours are compared.
+FORMATS: tuple[tuple[float, str, dict[str, Any]], ...] = (
+    (2e6, "webp", {"lossless": True, "quality": 40, "method": 2}),
+    (2e7, "jpeg", {"quality": 88, "subsampling": 0}),
+    (6e7, "jpeg", {"quality": 75, "subsampling": 0}),
 )
 
 
@@ -77,33 +76,8 @@ def data_uri(pixels: Codes, image_format: str = "webp", **options: Any) -> str:
     import PIL.Image
 
     file = io.BytesIO()
-    PIL.Image.fromarray(np.ascontiguousarray(pixels)).save(file, image_format, **(options or dict(FORMATS[0][1])))
+    PIL.Image.fromarray(np.ascontiguousarray(pixels)).save(file, image_format, **(options or FORMATS[0][2]))
     return f"data:image/{image_format};base64,{base64.b64encode(file.getvalue()).decode()}"
-
-
-def data_uris(pictures: Iterable[Codes], budget: int) -> tuple[list[str], str] | None:
-    """All pictures as files in the best format in which they fit together.
-
-    Args:
-        pictures: ``(H, W, 3)`` each; is gone through once for each format.
-        budget: characters.
-
-    Returns:
-        The files and the name of their format; ``None`` if none of :data:`FORMATS` is small enough.
-    """
-    pictures = list(pictures)
-    for image_format, options in FORMATS:
-        made: list[str] = []
-        left = budget
-        for picture in pictures:
-            made.append(data_uri(picture, image_format, **options))
-            left -= len(made[-1])
-            if left < 0:
-                break
-        else:
-            lossless = "lossless WebP" if "lossless" in options else f"JPEG of quality {options.get('quality')}"
-            return made, lossless
-    return None
 
 
 @dataclass(frozen=True)

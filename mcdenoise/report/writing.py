@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable, Mapping
-from datetime import datetime
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +14,12 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
-from mcdenoise.report.pictures import BRIGHTEST, data_uris, decode
+from mcdenoise.report.pictures import BRIGHTEST, FORMATS, data_uri, decode
 from mcdenoise.report.views import Range, Row, View, front, metrics, shortlist, views
 from mcdenoise.results import STAGES, Kind, Results
 
 FILE = "index.html"
 PLOTS = "plots"
-# Characters of all pictures of the comparer; the rest of the page is a few million.
-_PICTURE_BUDGET = 20_000_000
-# Beyond this many pixels even coarse JPEG does not fit: then the pictures are made smaller.
-_MOST_PIXELS = 60_000_000
 # The end of the heat map of SMAPE; larger errors look the same.
 _HEAT_END = 0.5
 # Methods of a page: more names than these cover one another in a plot.
@@ -39,8 +33,8 @@ def write_report(folder: Path) -> Path:
     named, and their figures are in ``results.csv``.
 
     The page is one file that needs no network and no server: an image comparer, close-ups, plots, tables that sort, and
-    temporal profiles. Its pictures are 8-bit previews, and are made coarser or smaller where they would be more than 20
-    megabytes; every figure is of the full data.
+    temporal profiles. Its pictures are 8-bit previews, which are coarser the more there are, and at last smaller; every
+    figure is of the full data.
 
     Args:
         folder: with ``results.json`` and, where pictures were kept, ``images/``.
@@ -62,7 +56,7 @@ def write_report(folder: Path) -> Path:
         "results": results,
         "others": [method.name for method in everything.methods if method not in results.methods],
         "verdict": _verdict(shown[0] if shown else View("", []), names),
-        "created": _date(results.created),
+        "created": f"{results.created[:16].replace('T', ' ')} UTC",
         "metrics": [_metric(name) for name in names],
         "columns": [_column(shown, name) for name in names],
         "views": shown,
@@ -232,21 +226,15 @@ def _file_name(name: str, place: int) -> str:
 
 def _galleries(folder: Path, results: Results) -> list[Gallery]:
     pixels, factor = picture_pixels(folder, results), 1
-    while pixels > _MOST_PIXELS * factor**2:
+    while pixels > FORMATS[-1][0] * factor**2:
         factor *= 2
     return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
 
 
 def _comparer(results: Results, galleries: list[Gallery], shown: list[View], names: list[str]) -> dict[str, Any]:
     """The data of the comparer's script: the pictures, their format, and the two to begin with."""
-    pictures = [codes for gallery in galleries for own in gallery.codes.values() for codes in own.values()]
-    encoded = data_uris(pictures, _PICTURE_BUDGET)
-    if encoded is None:
-        raise InputError(
-            f"pictures: expected at most {_PICTURE_BUDGET / 1e6:g} MB of them, found more even as coarse JPEG; "
-            "keep pictures of fewer frames"
-        )
-    files = iter(encoded[0])
+    pixels = sum(codes.size // 3 for gallery in galleries for own in gallery.codes.values() for codes in own.values())
+    kind, options = next((kind, options) for most, kind, options in FORMATS if pixels <= most)
     scenes = [
         {
             "name": gallery.scene.name,
@@ -257,7 +245,7 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
             # The frame of the close-ups, which has a reference, or else the last one.
             "start": gallery.scene.pictures.index(max(gallery.codes.get(REFERENCE) or gallery.scene.pictures)),
             "pictures": {
-                name: dict(zip(map(str, own), islice(files, len(own)), strict=True))
+                name: {str(number): data_uri(codes, kind, **options) for number, codes in own.items()}
                 for name, own in gallery.codes.items()
             },
         }
@@ -265,7 +253,7 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
         if gallery.codes
     ]
     return {
-        "format": encoded[1],
+        "format": "lossless WebP" if kind == "webp" else f"JPEG of quality {options['quality']}",
         "factor": max((gallery.factor for gallery in galleries), default=1),
         "first": _first_pair(results, shown, names),
         "data": {
@@ -345,14 +333,6 @@ def _number(value: Range | float | None, decimals: int | None = None) -> str:
     if decimals is not None and abs(figure) < 100:
         return f"{figure:.{decimals}f}"
     return f"{figure:,.0f}" if abs(figure) >= 100 else f"{figure:.3g}"
-
-
-def _date(text: str) -> str:
-    """A date such as ``21 October 2026, 12:00 UTC``; text that is no ISO time is returned unchanged."""
-    try:
-        return f"{datetime.fromisoformat(text):%-d %B %Y, %H:%M} UTC"
-    except ValueError:
-        return text
 
 
 def _heat_colors() -> list[list[int]]:

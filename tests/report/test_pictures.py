@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mcdenoise.report.pictures import BRIGHTEST, FORMATS, choose_crops, choose_row, data_uri, data_uris, decode, encode
+from mcdenoise.report.pictures import BRIGHTEST, choose_crops, choose_row, decode, encode
 
 
 def test_a_code_is_the_nearest_one():
@@ -18,17 +18,6 @@ def test_codes_of_known_values():
     assert encode(np.float32([0, 1, BRIGHTEST, 1e9, np.inf, np.nan, -3])).tolist() == [0, 187, 255, 255, 255, 0, 0]
     assert decode(np.array([0, 255])) == pytest.approx([0, BRIGHTEST])
     assert (encode(decode(np.arange(256)).astype(np.float32)) == np.arange(256)).all()
-
-
-def test_coarser_formats_when_the_budget_is_small():
-    codes = encode(np.random.default_rng(0).gamma(1, 1, (3, 64, 64, 3)).astype(np.float32))
-    sizes = [sum(len(data_uri(one, name, **options)) for one in codes) for name, options in FORMATS]
-    assert sizes == sorted(sizes, reverse=True)
-    assert data_uris(codes, sizes[0])[1] == "lossless WebP"
-    files, name = data_uris(codes, sizes[1])
-    assert name == "JPEG of quality 95"
-    assert sum(map(len, files)) <= sizes[1]
-    assert data_uris(codes, sizes[-1] - 1) is None
 
 
 def test_crops_are_where_images_differ_and_where_detail_is():

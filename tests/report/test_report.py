@@ -12,6 +12,7 @@ from small_benchmark import FRAMES, HOSTILE, save
 from mcdenoise.errors import InputError
 from mcdenoise.report import write_report
 from mcdenoise.report import writing as report_writing
+from mcdenoise.report.pictures import FORMATS
 from mcdenoise.report.views import views
 from mcdenoise.results import Results
 
@@ -104,11 +105,16 @@ def test_figures_are_those_of_the_results(folder: Path, outline: Outline):
     assert any("reproject 75%" in row for row in rows)
 
 
-def test_too_many_pictures_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch):
+def test_more_pictures_are_coarser_and_then_smaller(folder: Path, monkeypatch: pytest.MonkeyPatch):
     results = Results.read(folder)
-    monkeypatch.setattr(report_writing, "_PICTURE_BUDGET", 1000)
-    with pytest.raises(InputError, match="keep pictures of fewer frames"):
-        report_writing._comparer(results, report_writing._galleries(folder, results), views(results), ["SMAPE"])
+    told = []
+    for limits in ((1e9, 1e9, 1e9), (1e3, 1e9, 1e9), (1e3, 2e3, 5e4)):
+        formats = tuple((most, *each[1:]) for most, each in zip(limits, FORMATS, strict=True))
+        monkeypatch.setattr(report_writing, "FORMATS", formats)
+        content = report_writing._comparer(results, report_writing._galleries(folder, results), views(results), [])
+        told.append((content["format"], content["factor"], len(json.dumps(content["data"]))))
+    assert [each[:2] for each in told] == [("lossless WebP", 1), ("JPEG of quality 88", 1), ("JPEG of quality 75", 2)]
+    assert told[0][2] > told[1][2] > told[2][2]
 
 
 def copied(folder: Path, target: Path) -> Path:
@@ -122,6 +128,13 @@ def test_pictures_of_another_size(folder: Path, tmp_path: Path):
         report_writing._galleries(copy, Results.read(copy))
 
 
+@pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write no files of plots, which takes most of the time."""
+    monkeypatch.setattr("mcdenoise.report.plots.write_figure", lambda figure, path: None)
+
+
+@pytest.mark.usefixtures("no_plots")
 def test_without_pictures_the_rest_is_there(folder: Path, tmp_path: Path):
     (tmp_path / "results.json").write_text((folder / "results.json").read_text())
     page = write_report(tmp_path).read_text()
@@ -131,6 +144,7 @@ def test_without_pictures_the_rest_is_there(folder: Path, tmp_path: Path):
     assert Outline(page).rows
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_the_command_writes_the_page_of_a_finished_benchmark_again(folder: Path, tmp_path: Path) -> None:
     (folder / "index.html").unlink(missing_ok=True)
     for place, status in ((folder, 0), (tmp_path / "nowhere", 2)):
