@@ -146,8 +146,8 @@ def close_up(name: str) -> str:
         f"![Two crops: noisy, {name}, reference](../close_ups/{name}.webp){{ .pixels width=100% }}\n\n"
         f"The last frame of a demo of 16 frames: one sample a pixel on the left, `{name}` in the middle, the reference "
         f"of 128 samples on the right. Over the whole frame its SMAPE is {smape} and its PSNR {psnr} dB, where the "
-        f"noisy frame has {found['noisy'][0]} and {found['noisy'][1]} dB. `python docs/site/close_ups.py demo` makes such "
-        "pictures of the frames of `mcdenoise demo`."
+        f"noisy frame has {found['noisy'][0]} and {found['noisy'][1]} dB. `python docs/site/close_ups.py demo` makes "
+        "such pictures of the frames of `mcdenoise demo`."
     )
 
 
