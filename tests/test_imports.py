@@ -180,6 +180,19 @@ def test_no_import_goes_up() -> None:
     assert not [line for module, path in MODULES.items() for line in arrows(module, path.read_text())]
 
 
+def test_the_drawing_of_the_rooms_is_true() -> None:
+    """A room imports only rooms of lines below its own, and rooms to its left."""
+    page = (PACKAGE.parent / "docs" / "how-it-works.md").read_text(encoding="utf-8")
+    drawn = [line.split()[1:] for line in page.partition("```text\n")[2].partition("```")[0].splitlines()]
+    order = [room for line in reversed(drawn) for room in line]
+    assert sorted(order) == sorted({room_of(module) for module in MODULES} - {"", "__main__"})
+    for module, path in MODULES.items():
+        room = room_of(module)
+        others = {room_of(name) for name in imported(module, path.read_text()) if name.startswith("mcdenoise.")}
+        if room in order:
+            assert not [other for other in others - {room} if order.index(other) > order.index(room)], module
+
+
 def test_importing_is_silent_and_loads_nothing_optional() -> None:
     code = f"import sys\nfrom mcdenoise import *\nprint(*sorted({LAZY!r} & set(sys.modules)))"
     assert python(code).strip() == ""
