@@ -110,6 +110,20 @@ def test_every_local_link_exists(path: Path) -> None:
     assert [target for target in targets if not (path.parent / target).exists()] == []
 
 
+def test_pages_are_short_enough_to_be_read() -> None:
+    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in DOCS.glob("*.md")}
+    assert sum(words.values()) <= 20_000
+    assert max(words[f"for-{who}.md"] for who in ("artists", "engines", "researchers")) <= 900
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+
+
+def test_every_picture_is_shown() -> None:
+    shown = "".join(path.read_text(encoding="utf-8") for path in TEXTS)
+    pictures = [path.name for kind in ("png", "svg", "csv") for path in DOCS.rglob(f"*.{kind}")]
+    # The errors beside the close-ups are read by the pages of methods.
+    assert [name for name in pictures if name not in shown and name != "errors.csv"] == []
+
+
 def test_every_operator_is_in_the_table_of_kornia_and_every_function_there_exists() -> None:
     text = (DOCS / "kornia.md").read_text()
     rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| `")]
