@@ -27,7 +27,7 @@ def code_with(page: Path, part: str) -> dict:
 
 
 def test_its_counts_are_true() -> None:
-    operators, models = re.search(r"than (\d+) image\s+operators.*?zoo of some (\d+)", README, re.DOTALL).groups()
+    operators, models = re.search(r"than (\d+)\s+image\s+operators.*?zoo of some (\d+)", README, re.DOTALL).groups()
     assert int(operators) < len(OPS)
     assert abs(int(models) - len(list_models())) <= 5
 
