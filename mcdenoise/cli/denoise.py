@@ -19,10 +19,11 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data.files import make_folder
 from mcdenoise.data.images import FORMATS
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.errors import InputError
-from mcdenoise.folder import denoise_sequence, make_folder, prepare_folder
+from mcdenoise.folder import denoise_sequence, prepare_folder
 from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import pretrained_models

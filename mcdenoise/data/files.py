@@ -254,14 +254,8 @@ def remove(path: Path) -> None:
     Raises:
         InputError: it is not a file, or the operating system refuses.
     """
-    try:
+    with _writing(path):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(
-            f"{path}: expected to replace it, found what cannot be removed ({reason}); check the folder and its "
-            "permissions, or choose another"
-        ) from error
 
 
 def _lock(handle: int) -> bool:

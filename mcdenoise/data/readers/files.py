@@ -187,31 +187,24 @@ class RenderedFiles(FrameSequence):
         image, alpha, lights, output_layer, full_float = result
         layer = self.choice.written[0]
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
-        inside: dict[tuple[int, str], Image] = {}
+        places: dict[Layer, Sequence[str]] = {each: each.channels[:3] for each in self.choice.written}
         if output_layer is not None:
-            grey = len(layer.channels) == 1
-            names = [".".join((*layer.family, output_layer, letter)) for letter in ("Y" if grey else "RGB")]
-            planes = image.mean(-1, keepdims=True) if grey else image
-            inside = {(layer.part, name): planes[..., i] for i, name in enumerate(names)}
-        for each in self.choice.written if output_layer is None else ():
-            matrix = self.choice.converted.get(each)
-            if matrix is not None:
+            letters = "Y" if len(layer.channels) == 1 else "RGB"
+            places = {layer: [".".join((*layer.family, output_layer, letter)) for letter in letters]}
+        for each, names in places.items():
+            planes = image.mean(-1, keepdims=True) if len(names) == 1 else image
+            if (matrix := self.choice.converted.get(each)) is not None:
                 planes = (image @ matrix.T).astype(np.float32)
-            else:
-                planes = image.mean(-1, keepdims=True) if len(each.channels) == 1 else image
-            files[each.group] |= {(each.part, name): planes[..., i] for i, name in enumerate(each.channels[:3])}
+            files[each.group] |= {(each.part, name): planes[..., i] for i, name in enumerate(names)}
         if alpha is not None:
             own = layer if len(layer.channels) > 3 else self.choice.layers["alpha"]
             files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
         for group, channels in self._lights(number, lights).items():
             files[group] |= channels
         for group in {layer.group, *files}:
-            source, ours = self.groups[group].files[number], group == layer.group
-            target = out / self.target(source)
+            source = self.groups[group].files[number]
             write_like(
-                *(source, target, self._cropped(source, files[group])),
-                added={key[1]: pixels for key, pixels in self._cropped(source, inside).items()} if ours else {},
-                part=layer.part,
+                *(source, out / self.target(source), self._cropped(source, files[group])),
                 like=layer.channels[0],
                 full_float=full_float,
                 stored=self.parts[group][0],

@@ -1,11 +1,19 @@
-"""Writing a copy of a file with some channels replaced or added, and everything else unchanged."""
+"""Writing a copy of a file with some channels replaced or added, and everything else unchanged.
+
+OpenEXR's Python module fails on text in Latin-1, on a frame rate of 24/0 and on many types of attributes. So it gets a
+copy of the file in which each attribute that pixels do not need is a placeholder of the same length, and the written
+file gets the original bytes.
+"""
 
 from __future__ import annotations
 
+import mmap
+import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenEXR
@@ -13,20 +21,26 @@ import OpenEXR
 from mcdenoise.data.exr import LARGEST_HALF, Image, cannot_write, within_half, write_image
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
-from mcdenoise.data.readers.attributes import put_back, readable
 from mcdenoise.data.readers.transfer import encode
 
 # Names of the channels that DWA compression rounds, and its usual level.
 _DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45
 
+_MULTI_PART = 0x1000
+# The attributes without which a flat image cannot be read and written as it was, and their types.
+_NEEDED = {
+    **{b"channels": b"chlist", b"compression": b"compression", b"lineOrder": b"lineOrder", b"tiles": b"tiledesc"},
+    **{b"dataWindow": b"box2i", b"displayWindow": b"box2i", b"chunkCount": b"int", b"screenWindowCenter": b"v2f"},
+    **dict.fromkeys((b"pixelAspectRatio", b"screenWindowWidth", b"dwaCompressionLevel"), b"float"),
+    **dict.fromkeys((b"name", b"type"), b"string"),
+}
+
 
 def write_like(
     source: Path,
     target: Path,
-    replaced: Mapping[tuple[int, str], Image],
+    channels: Mapping[tuple[int, str], Image],
     *,
-    added: Mapping[str, Image],
-    part: int = 0,
     like: str = "",
     full_float: bool = False,
     stored: Part | None = None,
@@ -36,10 +50,8 @@ def write_like(
     Args:
         source: an existing image file.
         target: the file to write, atomically. Its folder must exist.
-        replaced: ``(H, W)`` pixels by part and channel.
-        added: ``(H, W)`` pixels of new channels of an EXR, by name.
-        part: the part that gets the new channels.
-        like: the channel of that part whose type the new channels get.
+        channels: ``(H, W)`` pixels by part and channel; those that the file lacks are added to an EXR.
+        like: the channel whose type new channels get.
         full_float: store all these channels as 32-bit floats, whatever the types were.
         stored: the curve of a picture that is no EXR; by default what the file says.
 
@@ -47,21 +59,15 @@ def write_like(
         InputError: the file cannot be written.
     """
     if FORMATS.get(source.suffix.lower()) != "openexr":
-        _write_picture(source, target, {name: image for (_, name), image in replaced.items()}, stored)
+        _write_picture(source, target, {name: image for (_, name), image in channels.items()}, stored)
         return
     with atomic_path(target) as temporary:
-        if reason := _write_exr(source, temporary, replaced, added, part, like, full_float):
+        if reason := _write_exr(source, temporary, channels, like, full_float):
             raise cannot_write(target, reason)
 
 
 def _write_exr(
-    source: Path,
-    target: Path,
-    replaced: Mapping[tuple[int, str], Image],
-    added: Mapping[str, Image],
-    part: int,
-    like: str,
-    full_float: bool,
+    source: Path, target: Path, channels: Mapping[tuple[int, str], Image], like: str, full_float: bool
 ) -> str:
     # Reading and writing may raise any exception of the underlying library.
     try:
@@ -69,25 +75,22 @@ def _write_exr(
         # The library skips unreadable parts with a printed warning. Suppressing that would also suppress the output of
         # all other threads.
         copy = target.with_suffix(".copy.exr")
-        with readable(source, copy) as originals:
+        with _readable(source, copy) as originals:
             file = OpenEXR.File(str(copy), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except Exception as error:
         return f"{source} cannot be read again: {_first_line(error)}"
     if not whole:
         return f"{source} has changed meanwhile, or has parts that cannot be written again"
-    for (index, name), image in replaced.items():
-        channel = file.parts[index].channels[name]
-        channel.pixels = _stored(image, np.float32 if full_float else channel.pixels.dtype)
-    if added:
-        main = file.parts[part]
-        kind = np.float32 if full_float or like not in main.channels else main.channels[like].pixels.dtype
-        channels = dict(main.channels)
-        for name, image in added.items():
-            if name in channels:
-                return f"it has a channel '{name}' already"
-            channels[name] = OpenEXR.Channel(name, _stored(image, kind))
-        main.channels = channels
+    for (index, name), image in channels.items():
+        part = file.parts[index]
+        old = part.channels.get(name, part.channels.get(like))
+        kind = np.float32 if full_float or old is None else old.pixels.dtype
+        pixels = np.ascontiguousarray(within_half(image) if kind == np.float16 else image, dtype=kind)
+        if name in part.channels:
+            old.pixels = pixels
+        else:
+            part.channels = {**part.channels, name: OpenEXR.Channel(name, pixels)}
     if clamped := {limit for each in file.parts if (limit := _leave_room(each))}:
         # The text is the same for all frames, so that it is told once.
         warnings.warn(
@@ -97,7 +100,7 @@ def _write_exr(
         )
     try:
         file.write(str(target))
-        put_back(target, originals)
+        _put_back(target, originals)
         written = read_image_header(target).parts
         # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
         for index, each in enumerate(written):
@@ -139,10 +142,6 @@ def _is_whole(found: Any, part: Part) -> bool:
     return set(channels) == set(part.channels) and all(each.pixels.shape == part.size for each in channels.values())
 
 
-def _stored(image: Image, kind: Any) -> Any:
-    return np.ascontiguousarray(within_half(image) if kind == np.float16 else image, dtype=kind)
-
-
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> None:
     """Write a file with one picture, with its other channels and its pixel type unchanged."""
     spec, header, pixels = read_picture(source)
@@ -153,3 +152,83 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], st
             display = stored.display_referred and name.lower() not in ("a", "alpha")
             pixels[..., place] = encode(image[..., None], stored.gamma)[..., 0] if display else image
     write_image(target, spec, pixels)
+
+
+class Record(NamedTuple):
+    """An attribute in the header of a file: name, type, byte count, value.
+
+    Args:
+        part: index of the part.
+        name: name of the attribute.
+        kind: type of the attribute.
+        start: file offset of the record.
+        value: file offset of the value.
+        end: file offset of the record's end.
+    """
+
+    part: int
+    name: bytes
+    kind: bytes
+    start: int
+    value: int
+    end: int
+
+
+def records(content: bytes | mmap.mmap) -> Iterator[Record]:
+    """The attributes of all parts of a file (OpenEXR File Layout, "Header"); ``ValueError`` if it is damaged."""
+    several = int.from_bytes(content[4:8], "little") & _MULTI_PART
+    place, part = 8, 0
+    while content[place]:
+        while content[place]:
+            name = content.find(b"\0", place)
+            kind = content.find(b"\0", name + 1)
+            value = kind + 5
+            end = value + int.from_bytes(content[kind + 1 : value], "little")
+            if not place < name < kind < end < len(content):
+                raise ValueError("damaged header")
+            yield Record(part, content[place:name], content[name + 1 : kind], place, value, end)
+            place = end
+        place, part = place + 1, part + 1
+        if not several:
+            return
+
+
+@contextmanager
+def _readable(source: Path, copy: Path) -> Iterator[dict[tuple[int, bytes], bytes]]:
+    """Write a copy that OpenEXR's Python module can read, for as long as the block lasts.
+
+    Args:
+        source: an EXR.
+        copy: path of the copy.
+
+    Yields:
+        The original records by part and name of the placeholder, for :func:`_put_back`.
+    """
+    originals: dict[tuple[int, bytes], bytes] = {}
+    try:
+        shutil.copyfile(source, copy)
+        with copy.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
+            for each in list(records(content)):
+                # As long as the name was: a file says that it has long ones.
+                name = (b"~%d" % len(originals)).ljust(len(each.name), b"~")
+                text = name + b"\0string\0"
+                rest = each.end - each.start - len(text) - 4
+                if rest >= 0 and not _is_needed(each, content):
+                    originals[each.part, name] = content[each.start : each.end]
+                    content[each.start : each.end] = text + rest.to_bytes(4, "little") + b"." * rest
+        yield originals
+    finally:
+        copy.unlink(missing_ok=True)
+
+
+def _put_back(target: Path, originals: dict[tuple[int, bytes], bytes]) -> None:
+    """Replace placeholder records by the original ones."""
+    with target.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
+        for each in list(records(content)):
+            content[each.start : each.end] = originals.get((each.part, each.name), content[each.start : each.end])
+
+
+def _is_needed(record: Record, content: mmap.mmap) -> bool:
+    value = content[record.value : record.end]
+    is_text = record.kind != b"string" or value.decode(errors="replace").encode() == value
+    return _NEEDED.get(record.name) == record.kind and is_text

@@ -13,8 +13,7 @@ from refusals import refused
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr
-from mcdenoise.data.readers.attributes import records
-from mcdenoise.data.readers.rewrite import write_like
+from mcdenoise.data.readers.rewrite import records, write_like
 from mcdenoise.folder import denoise_sequence
 
 Image = np.ndarray[Any, Any]
@@ -279,7 +278,7 @@ def test_bright_pixels_stay_finite_under_dwa(tmp_path: Path, compression: Any, l
     for seed, bright in enumerate((0.1, 0.5, 1.0)):
         image = np.where(np.random.default_rng(seed).random((64, 64, 3)) < bright, 1e5, 0.01).astype(np.float32)
         with pytest.warns(UserWarning, match="DWA"):
-            write_like(source, target, {(0, name): image[..., i] for i, name in enumerate("RGB")}, added={})
+            write_like(source, target, {(0, name): image[..., i] for i, name in enumerate("RGB")})
         ((_, channels),) = stored(target)
         written = np.stack([channels[name] for name in "RGB"], -1).astype(np.float64)
         assert np.isfinite(written).all()

@@ -11,6 +11,7 @@ They show that a reader copes with such names, not that it copes with such a ren
 Tests call :func:`write`; nothing that it writes is kept in the repository.
 """
 
+import re
 import sys
 from pathlib import Path
 
@@ -21,6 +22,84 @@ HERE = Path(__file__).resolve().parent
 FRAMES = (1, 2, 3)
 # The place of the camera of `examples/blender/render.py` in its first frame, its step, and the point that it looks at.
 CAMERA, STEP, TARGET = np.array((-0.6, -5.2, 1.7)), np.array((0.16, 0.05, 0.05)), np.array((0.1, 0.9, 0.95))
+
+
+# For each renderer its files, and in each the layers: names of channels, and the image of :func:`images` in them. After
+# a point or a colon, each letter is a channel, with a point before it or without; other names are of single channels.
+STATISTICS = """
+    mse.rgb color_variance    albedo_var.rgb albedo_variance    albedo_mse.rgb albedo_variance
+    diffuse_mse.rgb diffuse_variance    specular_mse.rgb specular_variance    normal_var.xyz normal_variance
+    zfiltered_var zeros
+"""
+RENDERMAN = """
+    albedo.rgb albedo    diffuse.rgb diffuse    specular.rgb specular    normal.xyz camera_normal
+    zfiltered depth_1e30    forward.xyz forward    backward.xyz backward    sampleCount ones
+"""
+PBRT = """
+    :RGB color    Albedo.RGB albedo    {P} camera_position    dzdx slope_x    dzdy slope_y    {N} camera_normal
+    {Ns} camera_normal    u u    v v    Variance.RGB color_variance    RelativeVariance.RGB relative_variance
+"""
+RENDERERS = {
+    # The ``gbuffer`` film of pbrt-v4, coordinate system "camera" (its default): x right, y up, z into the scene.
+    # Positions and normals are 0 where nothing is hit. pbrt stores its matrix for column vectors, although OpenEXR says
+    # rows: ``worldToCamera`` here is so.
+    "pbrt": {"frame{frame:04d}.exr": PBRT.format(P="P.XYZ", N="N.XYZ", Ns="Ns.XYZ")},
+    # The same film in pbrt-v4 before its channels were renamed: ``Px``, ``Nsx``.
+    "pbrt_2021": {"frame{frame:04d}.exr": PBRT.format(P="P:xyz", N="N:xyz", Ns="Ns:xyz")},
+    # The layers that Arnold's noice asks for: RGBA, denoise_albedo, N, Z, variance. Assumed: N in world space, Z 1e30
+    # where nothing is hit.
+    "arnold": {
+        "beauty.{frame:04d}.exr": """
+            :RGBA rgba    N.XYZ normal    Z depth_1e30    denoise_albedo.RGB albedo    denoise_albedo_noisy.RGB albedo
+            diffuse.RGB diffuse    specular.RGB specular    variance.RGB color_variance
+        """
+    },
+    # RenderMan's denoiser channels, lower-case components, Ci as the beauty, statistics in a file beside it. Assumed:
+    # normals in camera space (x right, y up, z into the scene), ``backward`` in pixels, previous - current.
+    "renderman": {
+        "beauty.{frame:04d}.exr": f"Ci.rgb color    a alpha {RENDERMAN}",
+        "beauty_variance.{frame:04d}.exr": STATISTICS,
+    },
+    # The same in one file, written with ``asrgba``: Ci and a are R, G, B, A.
+    "renderman_rgba": {"shot.{frame:04d}.exr": f":RGBA rgba {RENDERMAN} {STATISTICS}"},
+    # V-Ray with its denoiser: RGBA as rendered, ``effectsResult`` denoised. Assumed: normals in camera space, velocity
+    # current - previous in pixels, Z infinite where nothing is hit.
+    "vray": {
+        "render.{frame:04d}.exr": """
+            :RGBA rgba    Z depth_inf    diffuseFilter.RGB albedo    effectsResult.RGB blurred
+            normals.XYZ camera_normal    velocity.XYZ velocity
+        """
+    },
+    # Redshift: DiffuseFilter, BumpNormals, Z, MotionVectors, WorldPosition. Assumed: normals in world space, in
+    # components R, G, B; raw motion vectors in pixels with y up, current - previous; Z 0 where nothing is hit.
+    "redshift": {
+        "shot_{frame:04d}.exr": """
+            :RGBA rgba    Z depth_0    BumpNormals.RGB normal    DiffuseFilter.RGBA albedo_alpha
+            MotionVectors.RGB flow    WorldPosition.RGB position
+        """
+    },
+    # Octane with its denoiser: ``Beauty`` denoised, ``Beauty_Noisy`` as rendered. Assumed: the names of the normals and
+    # the depth, and that normals are encoded into 0..1, as Octane shows them.
+    "octane": {
+        "octane_{frame:04d}.exr": """
+            Beauty.RGBA blurred_alpha    Beauty_Noisy.RGBA rgba    DiffuseFilter.RGB albedo
+            ShadingNormal.RGB encoded_normal    Depth.Z depth_1e10
+        """
+    },
+    # Falcor's Mogwai: a file for each output of the graph, frames without padding. Assumed: world space; ``mvec`` is
+    # previous - current as a fraction of width and height, y down; linearZ 0 where nothing is hit.
+    "falcor": {
+        f"Mogwai.{output}.{{frame}}.exr": layer
+        for output, layer in {
+            "AccumulatePass.output": ":RGBA rgba",
+            "GBufferRT.diffuseOpacity": ":RGBA albedo_one",
+            "GBufferRT.normW": ":RGBA normal_zero",
+            "GBufferRT.posW": ":RGBA position_one",
+            "GBufferRT.linearZ": ":RG linear_depth",
+            "GBufferRT.mvec": ":RG motion_fraction",
+        }.items()
+    },
+}
 
 
 def write(renderer, folder, frames=FRAMES):
@@ -38,180 +117,61 @@ def write(renderer, folder, frames=FRAMES):
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for frame in frames:
-        for name, channels, attributes in RENDERERS[renderer](read(frame)):
+        source = read(frame)
+        attributes = {"worldtocamera": source["world_to_camera"]} if renderer == "pbrt" else {}
+        for name, layers in RENDERERS[renderer].items():
             written.append(folder / name.format(frame=frame))
-            save(written[-1], channels, attributes)
+            save(written[-1], channels_of(layers, images(source)), attributes)
     return written
 
 
-def pbrt(source):
-    """The ``gbuffer`` film of pbrt-v4, coordinate system "camera" (its default): x right, y up, z into the scene.
-
-    Positions and normals are 0 where nothing is hit. pbrt stores its matrix for column vectors, although OpenEXR says
-    rows: ``worldToCamera`` here is so.
-    """
-    yield "frame{frame:04d}.exr", _pbrt(source, "{}.{}", str.upper), {"worldtocamera": source["world_to_camera"]}
-
-
-def pbrt_2021(source):
-    """The same film in pbrt-v4 before its channels were renamed: ``Px``, ``Nsx``."""
-    yield "frame{frame:04d}.exr", _pbrt(source, "{}{}", str.lower), {}
+def channels_of(layers, pixels):
+    """The channels of layers of :data:`RENDERERS`."""
+    channels, words = {}, iter(layers.split())
+    for layer, image in zip(words, words, strict=True):
+        name, mark, letters = re.fullmatch(r"(.*?)(?:([.:])(\w+))?", layer).groups()
+        planes = np.atleast_3d(pixels[image])
+        for i, letter in enumerate(letters or [""]):
+            channels[f"{name}{(mark or '').strip(':')}{letter}"] = planes[..., i]
+    return channels
 
 
-def _pbrt(source, pattern, case):
-    spread = variance(source["color"])
-    slope = np.gradient(np.where(source["hit"], source["depth"], 0))
+def images(source):
+    """All that renderers store of a frame."""
+    hit, one = source["hit"], source["hit"][..., None].astype(np.float32)
+    depth, motion, color = source["depth"], source["motion"], source["color"]
+    nothing, light = 0 * depth[..., None], source["color"] - source["diffuse"]
+    varied = {name: source[name] for name in ("color", "albedo", "diffuse", "normal")} | {"specular": light}
+    slope_y, slope_x = np.gradient(np.where(hit, depth, 0))
     return {
-        **layer("", "RGB", source["color"]),
-        **layer("Albedo", "RGB", source["albedo"]),
-        **named(pattern, "P", case("xyz"), to_camera(source, source["position"], points=True)),
-        "dzdx": slope[1],
-        "dzdy": slope[0],
-        **named(pattern, "N", case("xyz"), to_camera(source, source["normal"])),
-        **named(pattern, "Ns", case("xyz"), to_camera(source, source["normal"])),
+        **source,
+        **{f"{name}_variance": variance(image) for name, image in varied.items()},
+        **{f"depth_{far}": np.where(hit, depth, float(far)) for far in ("0", "1e10", "1e30", "inf")},
+        "specular": light,
+        "blurred": blurred(color),
+        "rgba": joined(color, source["alpha"]),
+        "blurred_alpha": joined(blurred(color), source["alpha"]),
+        "albedo_alpha": joined(source["albedo"], source["alpha"]),
+        "relative_variance": variance(color) / np.maximum(color**2, 1e-4),
+        "camera_normal": to_camera(source, source["normal"]),
+        "camera_position": to_camera(source, source["position"], points=True),
+        "encoded_normal": np.where(hit[..., None], source["normal"] * 0.5 + 0.5, 0),
+        "zeros": np.zeros_like(depth),
+        "ones": np.ones_like(depth),
+        "slope_x": slope_x,
+        "slope_y": slope_y,
         "u": source["position"][..., 0] % 1,
         "v": source["position"][..., 1] % 1,
-        **layer("Variance", "RGB", spread),
-        **layer("RelativeVariance", "RGB", spread / np.maximum(source["color"] ** 2, 1e-4)),
+        "backward": joined(motion, nothing),
+        "forward": joined(source["to_next"], nothing),
+        "velocity": joined(-motion, nothing),
+        "flow": joined(motion * (-1, 1), nothing),
+        "albedo_one": joined(source["albedo"], one),
+        "normal_zero": joined(source["normal"], 0 * one),
+        "position_one": joined(source["position"], one),
+        "linear_depth": joined((depth * hit)[..., None], 0 * one),
+        "motion_fraction": motion / depth.shape[::-1],
     }
-
-
-def arnold(source):
-    """Return the layers that Arnold's noice asks for: RGBA, denoise_albedo, N, Z, variance.
-
-    Assumed: N in world space, Z 1e30 where nothing is hit.
-    """
-    channels = {
-        **layer("", "RGBA", with_alpha(source)),
-        **layer("N", "XYZ", source["normal"]),
-        "Z": np.where(source["hit"], source["depth"], 1e30),
-        **layer("denoise_albedo", "RGB", source["albedo"]),
-        **layer("denoise_albedo_noisy", "RGB", source["albedo"]),
-        **layer("diffuse", "RGB", source["diffuse"]),
-        **layer("specular", "RGB", source["color"] - source["diffuse"]),
-        **layer("variance", "RGB", variance(source["color"])),
-    }
-    yield "beauty.{frame:04d}.exr", channels, {}
-
-
-def renderman(source):
-    """RenderMan's denoiser channels, lower-case components, Ci as the beauty, statistics in a file beside it.
-
-    Assumed: normals in camera space (x right, y up, z into the scene), ``backward`` in pixels, previous - current.
-    """
-    channels = _renderman(source)
-    yield "beauty.{frame:04d}.exr", {**layer("Ci", "rgb", source["color"]), "a": source["alpha"], **channels}, {}
-    yield "beauty_variance.{frame:04d}.exr", _renderman_statistics(source), {}
-
-
-def renderman_rgba(source):
-    """The same in one file, written with ``asrgba``: Ci and a are R, G, B, A."""
-    channels = {**layer("", "RGBA", with_alpha(source)), **_renderman(source), **_renderman_statistics(source)}
-    yield "shot.{frame:04d}.exr", channels, {}
-
-
-def _renderman(source):
-    still = np.zeros_like(source["depth"])
-    backward = np.stack([*np.moveaxis(source["motion"], -1, 0), still], -1)
-    forward = np.stack([*np.moveaxis(source["to_next"], -1, 0), still], -1)
-    return {
-        **layer("albedo", "rgb", source["albedo"]),
-        **layer("diffuse", "rgb", source["diffuse"]),
-        **layer("specular", "rgb", source["color"] - source["diffuse"]),
-        **layer("normal", "xyz", to_camera(source, source["normal"])),
-        "zfiltered": np.where(source["hit"], source["depth"], 1e30),
-        **layer("forward", "xyz", forward),
-        **layer("backward", "xyz", backward),
-        "sampleCount": np.ones_like(source["depth"]),
-    }
-
-
-def _renderman_statistics(source):
-    spread = variance(source["color"])
-    return {
-        **layer("mse", "rgb", spread),
-        **layer("albedo_var", "rgb", variance(source["albedo"])),
-        **layer("albedo_mse", "rgb", variance(source["albedo"])),
-        **layer("diffuse_mse", "rgb", variance(source["diffuse"])),
-        **layer("specular_mse", "rgb", variance(source["color"] - source["diffuse"])),
-        **layer("normal_var", "xyz", variance(source["normal"])),
-        "zfiltered_var": np.zeros_like(source["depth"]),
-    }
-
-
-def vray(source):
-    """V-Ray with its denoiser: RGBA as rendered, ``effectsResult`` denoised.
-
-    Assumed: normals in camera space, velocity current - previous in pixels, Z infinite where nothing is hit.
-    """
-    channels = {
-        **layer("", "RGBA", with_alpha(source)),
-        "Z": np.where(source["hit"], source["depth"], np.inf),
-        **layer("diffuseFilter", "RGB", source["albedo"]),
-        **layer("effectsResult", "RGB", blurred(source["color"])),
-        **layer("normals", "XYZ", to_camera(source, source["normal"])),
-        **layer("velocity", "XYZ", np.concatenate([-source["motion"], 0 * source["depth"][..., None]], -1)),
-    }
-    yield "render.{frame:04d}.exr", channels, {}
-
-
-def redshift(source):
-    """Redshift: DiffuseFilter, BumpNormals, Z, MotionVectors, WorldPosition.
-
-    Assumed: normals in world space, in components R, G, B; raw motion vectors in pixels with y up, current - previous;
-    Z 0 where nothing is hit.
-    """
-    flow = np.stack([-source["motion"][..., 0], source["motion"][..., 1], 0 * source["depth"]], -1)
-    channels = {
-        **layer("", "RGBA", with_alpha(source)),
-        "Z": np.where(source["hit"], source["depth"], 0),
-        **layer("BumpNormals", "RGB", source["normal"]),
-        **layer("DiffuseFilter", "RGBA", with_alpha({**source, "color": source["albedo"]})),
-        **layer("MotionVectors", "RGB", flow),
-        **layer("WorldPosition", "RGB", source["position"]),
-    }
-    yield "shot_{frame:04d}.exr", channels, {}
-
-
-def octane(source):
-    """Octane with its denoiser: ``Beauty`` denoised, ``Beauty_Noisy`` as rendered.
-
-    Assumed: the names of the normals and the depth, and that normals are encoded into 0..1, as Octane shows them.
-    """
-    channels = {
-        **layer("Beauty", "RGBA", with_alpha({**source, "color": blurred(source["color"])})),
-        **layer("Beauty_Noisy", "RGBA", with_alpha(source)),
-        **layer("DiffuseFilter", "RGB", source["albedo"]),
-        **layer("ShadingNormal", "RGB", np.where(source["hit"][..., None], source["normal"] * 0.5 + 0.5, 0)),
-        **layer("Depth", "Z", np.where(source["hit"], source["depth"], 1e10)[..., None]),
-    }
-    yield "octane_{frame:04d}.exr", channels, {}
-
-
-def falcor(source):
-    """Falcor's Mogwai: a file for each output of the graph, frames without padding.
-
-    Assumed: world space; ``mvec`` is previous - current as a fraction of width and height, y down; linearZ 0 where
-    nothing is hit.
-    """
-    height, width = source["depth"].shape
-    one = source["hit"][..., None].astype(np.float32)
-    outputs = {
-        "AccumulatePass.output": layer("", "RGBA", with_alpha(source)),
-        "GBufferRT.diffuseOpacity": layer("", "RGBA", np.concatenate([source["albedo"], one], -1)),
-        "GBufferRT.normW": layer("", "RGBA", np.concatenate([source["normal"], 0 * one], -1)),
-        "GBufferRT.posW": layer("", "RGBA", np.concatenate([source["position"], one], -1)),
-        "GBufferRT.linearZ": layer("", "RG", np.stack([source["depth"] * source["hit"], 0 * source["depth"]], -1)),
-        "GBufferRT.mvec": layer("", "RG", source["motion"] / np.array((width, height))),
-    }
-    for output, channels in outputs.items():
-        yield f"Mogwai.{output}.{{frame}}.exr", channels, {}
-
-
-RENDERERS = {
-    writer.__name__: writer
-    for writer in (pbrt, pbrt_2021, arnold, renderman, renderman_rgba, vray, redshift, octane, falcor)
-}
 
 
 def read(frame):
@@ -253,8 +213,8 @@ def to_camera(source, vectors, points=False):
     return np.where(source["hit"][..., None], moved, 0)
 
 
-def with_alpha(source):
-    return np.concatenate([source["color"], source["alpha"][..., None]], -1)
+def joined(image, channel):
+    return np.concatenate([image, channel.reshape(*image.shape[:2], 1)], -1)
 
 
 def blurred(image):
@@ -267,15 +227,6 @@ def blurred(image):
 def variance(image):
     """The variance over 3x3 pixels, in place of that over samples, of which there is one."""
     return np.maximum(blurred(image**2) - blurred(image) ** 2, 0)
-
-
-def layer(name, components, values):
-    """Channels ``name.R`` and on; without a name ``R`` and on."""
-    return named("{}.{}" if name else "{}{}", name, components, values)
-
-
-def named(pattern, name, components, values):
-    return {pattern.format(name, component): values[..., i] for i, component in enumerate(components)}
 
 
 def save(path, channels, attributes):
