@@ -97,7 +97,7 @@ def test_a_still_in_python_is_denoised_by_what_suits_it() -> None:
 
 
 def test_the_first_frame_picks_the_model_of_a_denoiser(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
+    sequence = open_sequence(small_sequence, "0-1")
     name, why = default_model(sequence)
     denoiser, named = Denoiser(), Denoiser(name)
     assert denoiser.model is None
