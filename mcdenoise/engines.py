@@ -1,6 +1,6 @@
 """Tasks that other processes run: those of this machine, or the workers of a Ray cluster.
 
-Films and rendering hand their tasks to :func:`run_tasks`, which retries those whose workers are lost. A task keeps its
+Films and rendering hand their tasks to :func:`run_jobs`, which retries those whose workers are lost. A task keeps its
 results on the disk, and does not repeat what it finds there. Ray is optional, and imported on first use.
 """
 
@@ -11,10 +11,10 @@ import itertools
 import multiprocessing
 import os
 import platform
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from typing import Any, Protocol
 
@@ -31,14 +31,11 @@ _SECONDS_TO_END = 0.3
 
 @dataclass(frozen=True)
 class Task:
-    """A call that a worker can repeat, and what follows from it.
+    """A call that a worker can repeat.
 
     Args:
         function: of a module that workers can import.
         arguments: which can be pickled.
-        on_done: called with the answer; returns further tasks.
-        on_failed: called with the reason in one line, if the function raised an error or lost too many workers; returns
-            further tasks.
         rank: tasks of a lower rank are started first.
         progress: a value that changes whenever the task advances: one that loses its worker now and then is retried for
             as long as it does. By default only the number of losses counts.
@@ -46,14 +43,14 @@ class Task:
 
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
-    on_done: Callable[[Any], Iterable[Task]]
-    on_failed: Callable[[str], Iterable[Task]]
     rank: int = 0
     progress: Callable[[], object] = lambda: None
 
 
 # The answer of a call; or none, and why it failed.
 Outcome = tuple[Any, str | None]
+# It yields tasks, which run side by side, and is sent the outcome of each.
+Job = Generator[Sequence[Task], list[Outcome], None]
 
 
 class Engine(Protocol):
@@ -77,58 +74,75 @@ class Engine(Protocol):
         ...
 
 
-def run_tasks(engine: Engine, tasks: Iterable[Task], on_wait: Callable[[], object] = lambda: None) -> None:
-    """Run tasks, and those that follow from them, until each has succeeded or failed; closes the engine at the end.
+def run_jobs(engine: Engine, jobs: Iterable[Job], on_wait: Callable[[], object] = lambda: None) -> None:
+    """Run jobs side by side until each has ended; closes the engine at the end.
 
     A task whose worker is lost is retried, up to five times in a row without progress.
 
     Args:
         engine: runs the tasks.
-        tasks: started in this order, by rank.
+        jobs: their tasks are started in this order, by rank.
         on_wait: called several times a second.
     """
-    counter = itertools.count()
-    queue: list[tuple[int, int, _Attempt]] = []
-    running: dict[Future[Outcome], tuple[int, int, _Attempt]] = {}
+    numbers = itertools.count()
+    queue: list[_Attempt] = []
+    running: dict[Future[Outcome], _Attempt] = {}
 
-    def add(new: Iterable[Task]) -> None:
-        for task in new:
-            heapq.heappush(queue, (task.rank, next(counter), _Attempt(task, task.progress())))
+    def advance(job: Job, outcomes: list[Outcome] | None = None) -> None:
+        """Let a job yield its next tasks."""
+        tasks: Sequence[Task] = ()
+        try:
+            while not tasks:
+                tasks, outcomes = next(job) if outcomes is None else job.send(outcomes), []
+        except StopIteration:
+            return
+        together: list[Outcome | None] = [None] * len(tasks)
+        for place, task in enumerate(tasks):
+            heapq.heappush(queue, _Attempt(task.rank, next(numbers), task, job, together, place, task.progress()))
 
     with closing(engine):
-        add(tasks)
+        for job in jobs:
+            advance(job)
         while queue or running:
             while queue and len(running) < engine.slots():
-                place = heapq.heappop(queue)
-                task = place[-1].task
-                running[engine.submit(task.function, *task.arguments)] = place
+                attempt = heapq.heappop(queue)
+                running[engine.submit(attempt.task.function, *attempt.task.arguments)] = attempt
             for call in wait(running, _SECONDS_BETWEEN_POLLS, FIRST_COMPLETED).done:
-                place = running.pop(call)
-                attempt = place[-1]
-                try:
-                    answer, failure = call.result()
-                except engine.lost as error:
-                    if attempt.is_repeated():
-                        heapq.heappush(queue, place)
-                        continue
-                    failure = f"its worker was lost, {attempt.losses} times in a row ({type(error).__name__})"
-                except Exception as error:  # an answer that cannot be sent
-                    failure = describe_error(error)
-                add(attempt.task.on_done(answer) if failure is None else attempt.task.on_failed(failure))
+                attempt = running.pop(call)
+                outcome = attempt.together[attempt.place] = attempt.outcome(call, engine.lost)
+                if outcome is None:
+                    heapq.heappush(queue, attempt)
+                ended = [each for each in attempt.together if each is not None]
+                if len(ended) == len(attempt.together):
+                    advance(attempt.job, ended)
             on_wait()
 
 
-@dataclass
+@dataclass(order=True)
 class _Attempt:
-    task: Task
-    progress: object
-    losses: int = 0
+    """A task, its job, and the outcomes of the tasks that were yielded together; in the order of their start."""
 
-    def is_repeated(self) -> bool:
-        """Whether the task, which has lost its worker, is tried again."""
-        before, self.progress = self.progress, self.task.progress()
-        self.losses = 1 if self.progress != before else self.losses + 1
-        return self.losses < MOST_LOSSES
+    rank: int
+    number: int
+    task: Task = field(compare=False)
+    job: Job = field(compare=False)
+    together: list[Outcome | None] = field(compare=False)
+    place: int = field(compare=False)
+    progress: object = field(compare=False)
+    losses: int = field(default=0, compare=False)
+
+    def outcome(self, call: Future[Outcome], lost: tuple[type[BaseException], ...]) -> Outcome | None:
+        """The outcome; ``None`` if the task has lost its worker and is to be tried again."""
+        try:
+            return call.result()
+        except lost as error:
+            before, self.progress = self.progress, self.task.progress()
+            self.losses = 1 if self.progress != before else self.losses + 1
+            if self.losses < MOST_LOSSES:
+                return None
+            return None, f"its worker was lost, {self.losses} times in a row ({type(error).__name__})"
+        except Exception as error:  # an answer that cannot be sent
+            return None, describe_error(error)
 
 
 def _call(driver: str, function: Callable[..., Any], *arguments: Any) -> Outcome:
@@ -275,7 +289,7 @@ class RayEngine:
                     "`ray start --head`"
                 ) from error
         self._cpus, self._gpus = cpus, gpus
-        # Not Ray but `run_tasks` retries, which knows what the task has finished.
+        # Not Ray but `run_jobs` retries, which knows what the task has finished.
         options = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": 0, "scheduling_strategy": "SPREAD"}
         self._call = ray.remote(**options)(_call)
         self._calls: dict[Future[Outcome], Any] = {}

@@ -1,7 +1,6 @@
 """Commands that are told to end, at any moment: one line, the status of the signal, nothing left behind."""
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -171,39 +170,20 @@ def test_within_another_program_signals_are_left_as_they_were() -> None:
     assert signal.set_wakeup_fd(-1) == -1
 
 
-def interrupted_at_random(folder: Path, name: str, arguments: list[object], count: int, seed: int) -> None:
-    """Run a command to its end, and then end it at moments from its beginning to its end."""
-    draw = random.Random(seed)
-    start = time.monotonic()
-    whole = started(OBEYING, name, *arguments, folder=folder)
-    printed, errors = whole.communicate(timeout=300)
-    assert (whole.returncode, errors) == (0, "")
-    seconds = time.monotonic() - start
-    for _ in range(count):
-        number = draw.choice(list(WORDS))
-        process = started(OBEYING, name, *arguments, folder=folder)
-        assert process.stdout is not None
-        process.stdout.readline()
-        time.sleep(draw.uniform(0, 0.8 * seconds))
-        if process.poll() is None:
-            end(process, number, name, printed.count("\n") - 1)
-        else:
-            # It was faster than the first one, and its pipes are still open.
-            process.communicate()
-        assert not [path for path in folder.rglob("*") if path.name.startswith(".mcdenoise-")]
-
-
-def frames(folder: Path) -> list[object]:
-    """A shot of 160x90, as much as is needed for compiled kernels, and arguments that denoise it."""
+def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
+    """A shot of 160x90, large enough for compiled kernels, while modules are imported and then denoised."""
     torch = pytest.importorskip("torch")
     from mcdenoise import Frame
     from mcdenoise.data.readers.bmfr import write_bmfr_frame
 
-    for number in range(4):
+    for number in range(60):
         images = [torch.rand(1, count, 90, 160) for count in (3, 3, 1)]
-        write_bmfr_frame(folder / "inputs", number, Frame(*images[:2], depth=1 + images[2]))
-    return [folder / "inputs", "-o", folder / "out", "--model", "cascaded_v2_micro"]
-
-
-def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
-    interrupted_at_random(tmp_path, "denoise", frames(tmp_path), count=2, seed=0)
+        write_bmfr_frame(tmp_path / "inputs", number, Frame(*images[:2], depth=1 + images[2]))
+    for seconds, number in ((0.5, signal.SIGINT), (3.0, signal.SIGTERM)):
+        options = ("-o", tmp_path / "out", "--model", "cascaded_v2_micro")
+        process = started(OBEYING, "denoise", tmp_path / "inputs", *options, folder=tmp_path)
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(seconds)
+        end(process, number, "denoise")
+        assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".mcdenoise-")]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -81,16 +80,6 @@ class Settings:
                 raise InputError(f"--{option}: expected at least {minimum}, found {getattr(self, name)}")
         check_device(self.device)
 
-    @property
-    def timed_sizes(self) -> list[Size]:
-        """The sizes; none if only errors are measured."""
-        return list(self.sizes) if self.rounds else []
-
-    @property
-    def load(self) -> tuple[int, str]:
-        """The background load, as arguments of :func:`mcdenoise.benchmark.machine.busy_machine`."""
-        return self.busy, self.beside
-
 
 def run_benchmark(
     sequences: list[Sequence],
@@ -131,7 +120,7 @@ def run_benchmark(
         check_references(sequence)
     fix_threads(settings.threads)
     total = sum((settings.rounds + 1) * len(sequence) for sequence in sequences)
-    total += len(settings.timed_sizes) * (settings.rounds + 2)
+    total += len(settings.sizes) * (settings.rounds + 2) if settings.rounds else 0
     steps = iter(range(1, total + 1))
     with new_folder(out) as folder:
         results = _measure(sequences, methods, folder, settings, lambda: on_step(next(steps), total))
@@ -154,11 +143,12 @@ def _measure(
         skipped |= run.errors.skipped
         scenes.append(scene)
         cells += own
-    with busy_machine(*(settings.load if settings.timed_sizes else (0, ""))):
+    sizes = list(settings.sizes) if settings.rounds else []
+    with busy_machine(settings.busy if sizes else 0, settings.beside if sizes else ""):
         costs, fits = measure_sizes(
             [method for method in made.methods if method.model != _IDENTITY],
             made.denoisers,
-            settings.timed_sizes,
+            sizes,
             rounds=settings.rounds,
             threads=settings.threads,
             device=settings.device,
@@ -197,22 +187,10 @@ class _Made:
                 self.failures[method.name] = one_line(error)
 
 
-class _Read(NamedTuple):
-    number: int
-    frame: Frame
-    milliseconds: float
-
-
 class _SceneRun:
     """Runs all methods on one scene."""
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        made: _Made,
-        folder: Path,
-        settings: Settings,
-    ) -> None:
+    def __init__(self, sequence: Sequence, made: _Made, folder: Path, settings: Settings) -> None:
         self.errors = Errors(settings.metrics, settings.flip_every)
         self._sequence, self._made, self._settings = sequence, made, settings
         self._failures = dict(made.failures)
@@ -237,7 +215,7 @@ class _SceneRun:
         """Measure the scene: returns it, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
-            with busy_machine(*self._settings.load):
+            with busy_machine(self._settings.busy, self._settings.beside):
                 for _ in range(self._settings.rounds):
                     self._round(on_step)
         except InputError as error:
@@ -302,7 +280,8 @@ class _SceneRun:
                         self._times[method.name].setdefault(stage, []).append(milliseconds)
             on_step()
 
-    def _frames(self, *, reference: bool) -> Iterator[_Read]:
+    def _frames(self, *, reference: bool) -> Iterator[tuple[int, Frame, float]]:
+        """Number and buffers of each frame, and the milliseconds of reading them."""
         for timed in self._made.denoisers.values():
             # A still is a shot of one frame, which needs no history.
             timed.denoiser.reset(frames=1 if len(self._sequence) == 1 else None)
@@ -314,7 +293,7 @@ class _SceneRun:
                 frame, _ = frame.validate()
             except InputError as error:
                 raise InputError(f"{self._sequence.root}, frame {number}: {error}") from error
-            yield _Read(number, frame, reading)
+            yield number, frame, reading
 
     def _at_work(self) -> Iterator[tuple[Method, Timed]]:
         for method in self._made.methods:

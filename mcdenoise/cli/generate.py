@@ -14,7 +14,7 @@ from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.engines import RayEngine, Task, parse_workers, run_tasks
+from mcdenoise.engines import Job, RayEngine, Task, parse_workers, run_jobs
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, default_folder, open_assets
 from mcdenoise.scenes.generation import SequencePlan
@@ -147,19 +147,15 @@ def _on_ray(plan: TakePlan | SequencePlan, seeds: list[int], address: str, out: 
     with progress_bar() as progress:
         scenes = progress.add_task("scenes", total=len(seeds))
 
-        def task(seed: int) -> Task:
-            def done(written: Path) -> list[Task]:
+        def one(seed: int) -> Job:
+            [(written, reason)] = yield [Task(render_seed, (plan, seed))]
+            if reason is None:
                 progress.advance(scenes)
                 say(out / written.relative_to(folder))
-                return []
-
-            def fail(reason: str) -> list[Task]:
+            else:
                 failed.append({"scene": f"seed {seed}", "failed": reason})
-                return []
 
-            return Task(render_seed, (plan, seed), done, fail)
-
-        run_tasks(engine, map(task, seeds))
+        run_jobs(engine, map(one, seeds))
     print_rows(failed)
     return 1 if failed else None
 

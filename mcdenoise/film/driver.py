@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from mcdenoise.data.files import held, make_folder, sweep, write_json
-from mcdenoise.engines import Engine, RayEngine, Task, run_tasks
+from mcdenoise.engines import Engine, Job, RayEngine, Task, run_jobs
 from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
-from mcdenoise.film.pieces import Piece, cut
+from mcdenoise.film.pieces import cut
 from mcdenoise.film.record import Counter
 from mcdenoise.film.summary import Summary, summarize
 from mcdenoise.film.work import RECORDS, Found, Order
@@ -59,20 +59,18 @@ class ShotResult:
         found: result of the scan; ``None`` before it.
         made: number of frames that were denoised in this run.
         failed: for each failed frame, by number, the reason.
-        reason: why the whole shot failed; empty if it did not.
+        reason: why the whole shot failed; ``None`` if it did not.
         summary: of the finished frames; ``None`` before the last task of the shot.
         repeated: number of frames that were denoised again because their files had changed meanwhile.
-        waiting: number of pieces that have not ended.
     """
 
     shot: Shot
     found: Found | None = None
     made: int = 0
     failed: dict[int, str] = field(default_factory=dict)
-    reason: str = ""
+    reason: str | None = None
     summary: Summary | None = None
     repeated: int = 0
-    waiting: int = 0
 
     @property
     def complete(self) -> bool:
@@ -204,27 +202,29 @@ def _run(
 ) -> FilmResult:
     began, created = time.monotonic(), datetime.now(UTC).isoformat(timespec="seconds")
     run, out = f"{secrets.token_hex(8)}-", Path(os.path.abspath(film.out))
-    shots = [_Shot(film, Order(each, out, film.joint, film.threads, run), on_shot) for each in film.shots]
-    result = FilmResult([each.result for each in shots])
+    orders = [Order(each, out, film.joint, film.threads, run) for each in film.shots]
+    result = FilmResult([ShotResult(each) for each in film.shots])
+    counters = [Counter(each.records, run) for each in orders]
     pause, counted = _PAUSE, began
 
     def count() -> None:
         nonlocal pause, counted
         if (start := time.monotonic()) - counted >= pause:
-            for each in shots:
-                each.count()
+            for each, counter in zip(result.shots, counters, strict=True):
+                each.made = counter.count()
             counted = time.monotonic()
             pause = max(_PAUSE, _PAUSES * (counted - start))
             totals = [each.to_make for each in result.shots if not each.reason]
             on_progress(result.made, None if None in totals else sum(filter(None, totals)))
 
     try:
-        run_tasks(engine, [each.scan() for each in shots], count)
+        made = zip(orders, result.shots, counters, strict=True)
+        run_jobs(engine, [_shot(film, *each, on_shot) for each in made], count)
     finally:
         # No worker is alive any more: what is half-written belongs to those that were killed.
-        for each in shots:
-            each.count()
-            for folder in (each.order.folder, each.order.records):
+        for order, each, counter in zip(orders, result.shots, counters, strict=True):
+            each.made = counter.count()
+            for folder in (order.folder, order.records):
                 sweep(folder, youngest=0)
         result.seconds = time.monotonic() - began
         try:
@@ -237,65 +237,33 @@ def _run(
     return result
 
 
-class _Shot:
-    """The tasks of a shot, each of which says what comes next."""
-
-    def __init__(self, film: Film, order: Order, on_shot: Callable[[ShotResult], None]) -> None:
-        self.film, self.order, self.on_shot = film, order, on_shot
-        self.result = ShotResult(order.shot)
-        self._counter = Counter(order.records, order.run)
-
-    def count(self) -> int:
-        """Count the frames that were finished in this run."""
-        self.result.made = self._counter.count()
-        return self.result.made
-
-    def scan(self) -> Task:
-        return Task(work.scan, (self.order,), self._scanned, self._failed, _SCAN)
-
-    def _scanned(self, found: Found) -> Iterable[Task]:
-        self.result.found, self.result.shot = found, found.shot
-        self.result.failed.update(found.unreadable)
-        self.order = replace(self.order, shot=found.shot)
-        return self._make(found, set(found.numbers) - found.done)
-
-    def _make(self, found: Found, missing: set[int]) -> Iterable[Task]:
-        pieces = cut(found.numbers, missing, self.film.piece, found.overlap)
-        self.result.waiting = len(pieces)
-        return [self._piece(each) for each in pieces] or [self._summarize()]
-
-    def _piece(self, piece: Piece) -> Task:
-        def made(failures: Mapping[int, str]) -> Iterable[Task]:
-            self.result.failed.update(failures)
-            self.result.waiting -= 1
-            return [] if self.result.waiting else [self._summarize()]
-
-        def failed(reason: str) -> Iterable[Task]:
-            return made(dict.fromkeys(piece.wanted, reason))
-
-        return Task(work.make, (self.order, piece), made, failed, _MAKE, self.count)
-
-    def _summarize(self) -> Task:
-        return Task(summarize, (self.order,), self._summarized, self._failed, _SUMMARIZE)
-
-    def _summarized(self, summary: Summary) -> Iterable[Task]:
-        """Denoise frames again whose files have changed meanwhile, once; those that change again are not finished."""
-        result, unfinished = self.result, set(summary.unfinished)
+def _shot(film: Film, order: Order, result: ShotResult, counter: Counter, on_shot: Callable[[ShotResult], None]) -> Job:
+    """The tasks of a shot: scan it, make what is missing, summarize it; once more for files that changed meanwhile."""
+    [(found, result.reason)] = yield [Task(work.scan, (order,), _SCAN)]
+    if found is None:
+        on_shot(result)
+        return
+    result.found, result.shot = found, found.shot
+    result.failed.update(found.unreadable)
+    order = replace(order, shot=found.shot)
+    missing = set(found.numbers) - found.done
+    for again in (False, True):
+        pieces = cut(found.numbers, missing, film.piece, found.overlap)
+        outcomes = yield [Task(work.make, (order, each), _MAKE, counter.count) for each in pieces]
+        for piece, (failures, reason) in zip(pieces, outcomes, strict=True):
+            result.failed.update(dict.fromkeys(piece.wanted, str(reason)) if failures is None else failures)
+        [(summary, result.reason)] = yield [Task(summarize, (order,), _SUMMARIZE)]
+        if summary is None:
+            break
         # Frames of a lost piece may be finished.
-        unreadable = result.found.unreadable if result.found is not None else {}
-        result.failed = {n: why for n, why in result.failed.items() if n in unfinished or n in unreadable}
-        changed = unfinished - result.failed.keys()
-        if changed and result.found is not None and not result.repeated:
-            result.repeated = len(changed)
-            return self._make(result.found, changed)
-        reason = "its files have changed while the film was made, and once more; run the same command when they stay"
-        result.failed.update(dict.fromkeys(changed, reason))
-        self.count()
-        result.summary = summary
-        self.on_shot(result)
-        return []
-
-    def _failed(self, reason: str) -> Iterable[Task]:
-        self.result.reason = reason
-        self.on_shot(self.result)
-        return []
+        kept = summary.unfinished | found.unreadable.keys()
+        result.failed = {number: why for number, why in result.failed.items() if number in kept}
+        missing = set(summary.unfinished) - result.failed.keys()
+        if again or not missing:
+            reason = "its files changed while the film was made, and once more; run the same command when they stay"
+            result.failed.update(dict.fromkeys(missing, reason))
+            result.summary = summary
+            break
+        result.repeated = len(missing)
+    result.made = counter.count()
+    on_shot(result)

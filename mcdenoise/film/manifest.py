@@ -85,43 +85,45 @@ def _of_pattern(pattern: Path, settings: ShotSettings) -> list[Shot]:
     return [_shot("_".join(path.parts[p] for p in wildcards), (path,), settings, str(pattern)) for path in found]
 
 
+class _Entry(msgspec.Struct):
+    """What a table of a shot has beside settings."""
+
+    name: str
+    input: str | list[str]
+
+
+class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
+    every: dict[str, Any] = {}
+    shot: list[_Entry] = []
+    shots: str = ""
+
+
 def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     try:
         content = tomllib.loads(read_text(path))
+        manifest = msgspec.convert(content, _Manifest)
+        if bool(manifest.shot) is bool(manifest.shots):
+            raise ValueError("both or none of them")
     except OSError as error:
         raise InputError(f"{path}: expected a manifest of a film, found: {error.strerror}; check the path") from error
     # An integer of too many digits is a ValueError, as are all others.
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: expected TOML, found: {error}; mend it there") from error
-    if unknown := sorted(content.keys() - {"shot", "every", "shots"}):
         raise InputError(
-            f"{path}: expected tables [[shot]] and perhaps [every], found '{unknown[0]}'; settings stand in one of them"
-        )
-    every, tables, pattern = content.get("every", {}), content.get("shot"), content.get("shots")
-    if not isinstance(every, dict):
-        raise InputError(f"{path}: expected 'every' to be a table, found {_found(every)}; write [every]")
-    settings = _settings(every, settings, f"{path}, [every]", path.parent)
-    if pattern is not None:
-        if tables is not None or not isinstance(pattern, str):
-            raise InputError(
-                f"{path}: expected 'shots' to be a pattern of folders, and no table [[shot]] beside it, found "
-                f"{_found(pattern)}; write one of both"
-            )
-        return _of_pattern(path.parent / pattern, settings)
-    if not isinstance(tables, list) or not tables or not all(isinstance(each, dict) for each in tables):
-        raise InputError(
-            f"{path}: expected a table [[shot]] for each shot, found none; write [[shot]] with name, input; or shots = "
-            "'a pattern of folders'"
-        )
+            f"{path}: expected TOML with tables [[shot]] of name and input, or shots = 'a pattern of folders', and "
+            f"perhaps [every], found: {printable(str(error))[:300]}; mend it there"
+        ) from error
+    settings = _settings(manifest.every, settings, f"{path}, [every]", path.parent)
+    if manifest.shots:
+        return _of_pattern(path.parent / manifest.shots, settings)
     shots = []
-    for number, table in enumerate(tables, 1):
-        name = table.get("name")
-        where = f"{path}, shot {number}" + (f" '{name}'" if isinstance(name, str) else "")
-        if not isinstance(name, str):
-            raise InputError(f"{where}: expected 'name', a text, found {_found(name)}; it is that of the folder")
+    for number, (entry, table) in enumerate(zip(manifest.shot, content["shot"], strict=True), 1):
+        where = f"{path}, shot {number} '{entry.name}'"
         own = {key: value for key, value in table.items() if key not in _OWN}
-        inputs = _inputs(table.get("input"), where, path.parent)
-        shots.append(_shot(name, inputs, _settings(own, settings, where, path.parent), where))
+        inputs = [entry.input] if isinstance(entry.input, str) else entry.input
+        if not all(inputs) or "\0" in "".join(inputs) or not inputs:
+            raise InputError(f"{where}: expected 'input', folders, files or patterns, found {_found(entry.input)}")
+        paths = tuple(path.parent / each for each in inputs)
+        shots.append(_shot(entry.name, paths, _settings(own, settings, where, path.parent), where))
     return shots
 
 
@@ -133,15 +135,6 @@ def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: st
             f"one of {', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
         )
     return Shot(name, tuple(Path(os.path.abspath(path)) for path in inputs), settings)
-
-
-def _inputs(given: Any, where: str, base: Path) -> tuple[Path, ...]:
-    texts = given if isinstance(given, list) else [given]
-    if not texts or not all(isinstance(each, str) and each and "\0" not in each for each in texts):
-        raise InputError(
-            f"{where}: expected 'input', a folder, file or pattern or a list of these, found {_found(given)}; name it"
-        )
-    return tuple(base / each for each in texts)
 
 
 def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base: Path) -> ShotSettings:

@@ -119,12 +119,6 @@ class Opened:
     unreadable: Mapping[int, str]
     settings: str
 
-    def window(self, number: int) -> list[int]:
-        """The frame, and the frames in its history."""
-        place = self.sequence.numbers.index(number)
-        first = 0 if self.overlap is None else max(0, place - self.overlap)
-        return self.sequence.numbers[first : place + 1]
-
 
 class Keys:
     """Keys of frames. Frames are asked for in ascending order, so that each file is read at most once.
@@ -151,7 +145,10 @@ class Keys:
 
     def key(self, number: int) -> str:
         """The key of a frame: a digest of all that decides its result."""
-        window = self.opened.window(number)
+        numbers, overlap = self.opened.sequence.numbers, self.opened.overlap
+        place = numbers.index(number)
+        # The frame, and the frames in its history.
+        window = numbers[0 if overlap is None else max(0, place - overlap) : place + 1]
         key = digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
         # The next frames are added in another thread.
         for each in [each for each in list(self._inputs) if each < window[0]]:

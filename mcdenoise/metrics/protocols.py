@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mcdenoise.metrics._check import UncomputableError, check_images
-from mcdenoise.metrics.display import displayed, flip, psnr_srgb, ssim_of, ssim_srgb
+from mcdenoise.metrics.display import flip, psnr_srgb, ssim_of, ssim_srgb
 from mcdenoise.metrics.metric import Metric
 
 ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
@@ -40,14 +40,12 @@ class Protocol:
 
     Args:
         description: tone curve, rounding, SSIM, and skipped frames and rows, in one line.
-        show: maps ``(..., 3, H, W)`` scene-linear radiance to the values that are compared.
         metrics: metrics by name; they take scene-linear radiance like those of :mod:`mcdenoise.metrics`.
         skipped_frames: number of frames at the start of a sequence that are not compared.
         missing: metrics of the publication that are not computed here, with the reason.
     """
 
     description: str
-    show: Callable[[Tensor], Tensor]
     metrics: Mapping[str, Metric]
     skipped_frames: int = 0
     missing: Mapping[str, str] = field(default_factory=dict)
@@ -183,13 +181,11 @@ _noisebase = partial(_of_shown, _show_noisebase)
 PROTOCOLS: dict[ProtocolName, Protocol] = {
     "strict": Protocol(
         "clamped to [0, 1], sRGB curve, floats; SSIM with an 11x11 Gaussian window and data range 1; every frame",
-        displayed,
         {"PSNR": Metric(psnr_srgb, higher_is_better=True), "SSIM": Metric(ssim_srgb, higher_is_better=True)},
     ),
     "meng2020": Protocol(
         "x^0.454545, clamped to [0, 1], rounded to 8 bits; SSIM with a 7x7 box window, sample covariance and data "
         "range 2; RMSE, SMAPE (in per cent) and relMSE of the same values",
-        _show_meng2020,
         {
             "PSNR": Metric(_meng2020(_psnr), higher_is_better=True),
             "SSIM": Metric(_meng2020(_ssim_default), higher_is_better=True),
@@ -200,7 +196,6 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
     ),
     "fan2021": Protocol(
         "x^0.454545, clamped to [0, 1], floats; SSIM with a 7x7 box window, sample covariance and data range 2",
-        gamma_displayed,
         {
             "PSNR": Metric(_fan2021(_psnr), higher_is_better=True),
             "SSIM": Metric(_fan2021(_ssim_default), higher_is_better=True),
@@ -209,7 +204,6 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
     "noisebase": Protocol(
         "ACES fit, clamped to [0, 1], gamma 1/2.2, truncated to 8 bits; SSIM with an 11x11 Gaussian window and data "
         "range 1 of the luminance of x^2.2; without the first 16 frames, and with the middle 1024 of 1080 rows",
-        _show_noisebase,
         {
             "PSNR": Metric(_noisebase(_psnr), higher_is_better=True),
             "SSIM": Metric(_noisebase(_ssim_luminance), higher_is_better=True),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from statistics import fmean
 
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
-from mcdenoise.results import STAGES, Cell, Method, Results, Spread
+from mcdenoise.results import STAGES, Method, Results, Spread
 
 FILE_STAGES = ("read", "write")
 
@@ -89,12 +90,14 @@ def views(results: Results) -> list[View]:
     In the mean every scene counts the same, and a method that failed on one of them has a reason and no figures.
     """
     scenes = [
-        View(scene.name, [_row(results, number, method, scene.name) for number, method in _numbered(results)])
+        View(
+            scene.name, [_row(results, number, method, scene.name) for number, method in enumerate(results.methods, 1)]
+        )
         for scene in results.scenes
     ]
     if len(scenes) < 2:
         return scenes
-    rows = [_mean([view.rows[number - 1] for view in scenes], results) for number, _ in _numbered(results)]
+    rows = [_mean(list(rows), results) for rows in zip(*(view.rows for view in scenes), strict=True)]
     return [View(f"mean of {len(scenes)} scenes", rows), *scenes]
 
 
@@ -184,10 +187,6 @@ def pareto_front(values: Sequence[tuple[float, float]], *, higher_is_better: boo
     return front
 
 
-def _numbered(results: Results) -> Iterable[tuple[int, Method]]:
-    return enumerate(results.methods, start=1)
-
-
 def _row(results: Results, number: int, method: Method, scene: str) -> Row:
     cell = results.cell(scene, method.name)
     if method.missing or cell is None or cell.failure:
@@ -201,18 +200,16 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
     return Row(
         method,
         number,
-        {name: _error(cell, name) for name in cell.errors},
+        {
+            name: replace(_range(cell.errors_spread[name]), value=x) if name in cell.errors_spread else Range(x, x, x)
+            for name, x in cell.errors.items()
+        },
         milliseconds,
         None if cell.whole is None else _range(cell.whole),
         {stage: _range(cell.stages[stage]) for stage in STAGES if stage in cell.stages},
         size / milliseconds.value / 1e3 if milliseconds and milliseconds.value > 0 else None,
         cell.memory,
     )
-
-
-def _error(cell: Cell, name: str) -> Range:
-    value, spread = cell.errors[name], cell.errors_spread.get(name)
-    return Range(value, spread.lower, spread.upper) if spread else Range(value, value, value)
 
 
 def _range(spread: Spread) -> Range:
@@ -243,12 +240,7 @@ def _mean(rows: list[Row], results: Results) -> Row:
 
 
 def _mean_range(ranges: list[Range]) -> Range:
-    count = len(ranges)
-    return Range(
-        sum(one.value for one in ranges) / count,
-        sum(one.lower for one in ranges) / count,
-        sum(one.upper for one in ranges) / count,
-    )
+    return Range(*(fmean(each) for each in zip(*((one.value, one.lower, one.upper) for one in ranges), strict=True)))
 
 
 def _mean_of(ranges: list[Range | None]) -> Range | None:
@@ -258,4 +250,4 @@ def _mean_of(ranges: list[Range | None]) -> Range | None:
 
 def _mean_number(numbers: list[float | None]) -> float | None:
     known = [one for one in numbers if one is not None]
-    return sum(known) / len(known) if len(known) == len(numbers) else None
+    return fmean(known) if len(known) == len(numbers) else None

@@ -13,7 +13,7 @@ import pytest
 from calls import die_at_first, fail, fail_strangely, mark
 
 from mcdenoise import engines
-from mcdenoise.engines import MOST_LOSSES, Engine, LocalEngine, RayEngine, Task, open_engine, run_tasks
+from mcdenoise.engines import MOST_LOSSES, Job, LocalEngine, RayEngine, Task, open_engine, run_jobs
 from mcdenoise.errors import InputError
 
 
@@ -24,34 +24,36 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Run:
-    """Tasks with names, and what came of them."""
+    """Jobs with names, one task each, and what came of them."""
 
     def __init__(self) -> None:
         self.answers: dict[str, object] = {}
         self.failed: dict[str, str] = {}
-        self.tasks: list[Task] = []
+        self.jobs: list[Job] = []
 
-    def add(self, name: str, function: object, *arguments: object, then: tuple[Task, ...] = (), **options: Any) -> None:
-        def done(answer: object) -> tuple[Task, ...]:
+    def add(self, name: str, function: object, *arguments: object, **options: Any) -> None:
+        self.jobs.append(self._job(name, Task(function, arguments, **options)))  # type: ignore[arg-type]
+
+    def _job(self, name: str, task: Task) -> Job:
+        [(answer, reason)] = yield [task]
+        if reason is None:
             self.answers[name] = answer
-            return then
-
-        def failed(reason: str) -> tuple[Task, ...]:
+        else:
             self.failed[name] = reason
-            return ()
-
-        self.tasks.append(Task(function, arguments, done, failed, **options))  # type: ignore[arg-type]
-
-    def on(self, engine: Engine) -> Run:
-        run_tasks(engine, self.tasks)
-        return self
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes kill themselves by a signal")
 def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> None:
-    run, follow = Run(), Run()
-    follow.add("next", mark, tmp_path, "next")
-    run.add("quiet", mark, tmp_path, "quiet", then=tuple(follow.tasks))
+    run = Run()
+
+    def in_turn() -> Job:
+        # Two tasks side by side, none, and one after them.
+        names: list[str] = []
+        for together in (["one", "other"], [], ["next"]):
+            names += [answer for answer, _ in (yield [Task(mark, (tmp_path, name)) for name in together])]
+        run.answers["in turn"] = names
+
+    run.jobs.append(in_turn())
     run.add("failing", fail, "two\nlines")
     run.add("strange", fail_strangely)
     run.add("exits", sys.exit, 0)
@@ -60,11 +62,10 @@ def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> Non
     # This one advances with each attempt, so that it may lose more workers than others.
     advances = {"progress": lambda: len(list(tmp_path.glob("advancing.try*")))}
     run.add("advancing", die_at_first, tmp_path, "advancing", MOST_LOSSES + 1, **advances)
-    run.on(LocalEngine(2))
+    run_jobs(LocalEngine(2), run.jobs)
     assert f"{MOST_LOSSES} times" in run.failed.pop("hopeless")
     assert run.failed == {"failing": "RuntimeError: two lines", "strange": "Strange: 7 and 8", "exits": "SystemExit: 0"}
-    assert set(run.answers) == {"quiet", "lost", "advancing"}
-    assert set(follow.answers) == {"next"}
+    assert run.answers == {"in turn": ["one", "other", "next"], "lost": "lost", "advancing": "advancing"}
     # Nobody tries more often than that.
     assert not (tmp_path / "hopeless").exists()
 
@@ -104,7 +105,7 @@ def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
         if len(killed) < 3 and (not killed or len(run.answers) >= len(killed)):
             killed.append(kill_children())
 
-    run_tasks(LocalEngine(2), run.tasks, attack)
+    run_jobs(LocalEngine(2), run.jobs, attack)
     assert run.failed == {}
     assert min(killed) >= 1
     assert sorted(path.name for path in tmp_path.iterdir()) == names

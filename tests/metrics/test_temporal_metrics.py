@@ -8,7 +8,6 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from mcdenoise.metrics import (
-    Flicker,
     UncomputableError,
     displayed,
     flicker_srgb,
@@ -107,8 +106,3 @@ def test_flicker_is_the_standard_deviation_of_each_pixel() -> None:
     shown, expected = (displayed(x).double().std(1, correction=0).mean((-3, -2, -1)) for x in (clip, reference))
     # Measured: 3e-8.
     torch.testing.assert_close(flicker_srgb(clip, reference).double(), shown - expected, atol=1e-6, rtol=0)
-    flicker = Flicker()
-    for image, truth in zip(clip.unbind(1), reference.unbind(1), strict=True):
-        flicker.add(image, truth)
-    assert flicker.frames == 9
-    torch.testing.assert_close(flicker.value(), flicker_srgb(clip, reference))

@@ -8,7 +8,7 @@ from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.engines import Engine, Task, run_tasks
+from mcdenoise.engines import Engine, Job, Task, run_jobs
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.folder import ReferenceState
 from mcdenoise.scenes.render.frames import FrameJob, render_frame
@@ -67,18 +67,14 @@ def render_on_engine(
     """
     failed: list[str] = []
 
-    def task(number: int) -> Task:
-        def done(state: ReferenceState | None) -> list[Task]:
+    def one(number: int) -> Job:
+        [(state, reason)] = yield [Task(render_frame_task, (source, job, number))]
+        if reason is None:
             on_frame(number, state)
-            return []
-
-        def fail(reason: str) -> list[Task]:
+        else:
             failed.append(f"frame {number}: {reason}")
-            return []
 
-        return Task(render_frame_task, (source, job, number), done, fail)
-
-    run_tasks(engine, map(task, numbers))
+    run_jobs(engine, map(one, numbers))
     if failed:
         others = f"; {len(failed) - 1} more frames failed" if len(failed) > 1 else ""
         raise InputError(f"{failed[0]}{others}; finished frames are kept")
