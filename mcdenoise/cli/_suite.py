@@ -15,7 +15,6 @@ from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.shot import default_model
 from mcdenoise.suite import (
     SHOWN,
-    Progress,
     choose_rows,
     error_against_time,
     lines_of,
@@ -56,13 +55,13 @@ def score_suite(
     with progress_bar() as progress:
         task = progress.add_task("render", total=None)
 
-        def show(step: Progress) -> None:
-            described = f"render {step.shot}, references to {step.fraction:.0%}"
-            progress.update(task, description=described, completed=step.done, total=step.total)
+        def show(shot: str, fraction: float, done: int, total: int) -> None:
+            described = f"render {shot}, references to {fraction:.0%}"
+            progress.update(task, description=described, completed=done, total=total)
 
         if render:
             wanted = dict.fromkeys(row.shot for row in rows)
-            render_suite(wanted, data, blender_python=blender_python, threads=settings.threads, on_progress=show)
+            render_suite(wanted, data, blender_python=blender_python, threads=settings.threads, on_step=show)
     if out is None:
         say(data)
         return 0

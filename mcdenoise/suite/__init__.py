@@ -1,7 +1,7 @@
 """A test suite of rendered frames that no model was trained on: its list of rows, its rendering, and its tables."""
 
 from mcdenoise.suite.close_ups import write_close_ups
-from mcdenoise.suite.rendering import Progress, open_row, render_suite, rows_there
+from mcdenoise.suite.rendering import open_row, render_suite, rows_there
 from mcdenoise.suite.rows import SHOTS, Row, Shot, choose_rows
 from mcdenoise.suite.tables import (
     SHOWN,
@@ -20,7 +20,6 @@ __all__ = [
     "SHOWN",
     "Line",
     "MethodMean",
-    "Progress",
     "Row",
     "Shot",
     "choose_rows",

@@ -7,9 +7,9 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,29 +34,13 @@ _SEED, _REFERENCE_SEED = 77, 1_000_000
 _LENS, _FOCUS = 0.03, 3.4
 
 
-class Progress(NamedTuple):
-    """Progress of the rendering.
-
-    Args:
-        shot: the shot that is rendered next.
-        fraction: fraction of its reference samples that is rendered.
-        done: number of finished steps; each shot is one step per fraction.
-        total: number of all steps.
-    """
-
-    shot: str
-    fraction: float
-    done: int
-    total: int
-
-
 def render_suite(
     shots: Iterable[Shot],
     data: Path,
     *,
     blender_python: Path | None = None,
     threads: int = 0,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_step: Callable[[str, float, int, int], None] = lambda shot, fraction, done, total: None,
 ) -> None:
     """Render the missing files of shots; a file gets its final name once it is complete.
 
@@ -66,7 +50,8 @@ def render_suite(
         blender_python: a Python interpreter that can import ``bpy``, for the shots of Cycles; by default as in
             :class:`mcdenoise.scenes.cycles.Blender`.
         threads: number of threads for Cycles; 0 uses all processors.
-        on_progress: called before each step.
+        on_step: called before each step with the name of the shot, the fraction of its reference samples that will be
+            there, and the numbers of finished and of all steps.
 
     Raises:
         InputError: a renderer is missing or failed, or the folder cannot be written or holds other files.
@@ -82,7 +67,7 @@ def render_suite(
         raise InputError(f"{data}: cannot be created ({error.strerror}); choose another folder with --data") from error
     steps = [(fraction, shot) for fraction in _FRACTIONS for shot in shots]
     for number, (fraction, shot) in enumerate(steps):
-        on_progress(Progress(shot.name, fraction, number, len(steps)))
+        on_step(shot.name, fraction, number, len(steps))
         if shot.renderer == "mitsuba":
             _render_mitsuba(shot, data, fraction)
         else:
@@ -193,16 +178,7 @@ def _image(frame: int, samples: int, seed: int, out: Path, *, passes: bool) -> d
 
 
 def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads: int) -> None:
-    job = {
-        "scene": shot.scene,
-        "size": shot.size,
-        "frames": shot.frames,
-        "filter": shot.filter,
-        "lens": shot.lens,
-        "blur": shot.blur,
-        "threads": threads,
-        "images": images,
-    }
+    job = asdict(shot) | {"threads": threads, "images": images}
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "job.json"
         path.write_text(json.dumps(job))

@@ -85,6 +85,7 @@ def test_an_input_that_is_not_unicode_fails_alone(tmp_path: Path) -> None:
     assert not pixels(out / "bad")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can mount")
 def test_a_full_disk_costs_what_has_no_room(tmp_path: Path) -> None:
     """The film ends with a table and status 1, and the next one, with room, completes it."""

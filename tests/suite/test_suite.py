@@ -59,13 +59,10 @@ def test_rendering_resumes_and_shares_references(tmp_path: Path, two_shots: list
     mitsuba = pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     # Rendering so small an image takes less time than compiling a kernel.
     mitsuba.set_variant("scalar_rgb")
-    stages = []
-    render_suite(two_shots, tmp_path, on_progress=stages.append)
-    assert [(stage.shot, stage.fraction) for stage in stages] == [
-        ("tiny-1", 0.25),
-        ("tiny-2", 0.25),
-        ("tiny-1", 1.0),
-        ("tiny-2", 1.0),
+    steps: list[tuple[Any, ...]] = []
+    render_suite(two_shots, tmp_path, on_step=lambda *step: steps.append(step))
+    assert [(shot, fraction) for shot, fraction, *_ in steps] == [
+        (shot.name, fraction) for fraction in (0.25, 1.0) for shot in two_shots
     ]
     rows = [Row(shot, still) for shot in two_shots for still in (False, True)]
     assert rows_there(rows, tmp_path) == rows
