@@ -49,23 +49,6 @@ class CloseUp:
 
 
 @dataclass(frozen=True)
-class Stripe:
-    """The part of the frames that temporal profiles show.
-
-    Args:
-        row: row of the frame.
-        left: first column.
-        width: number of columns.
-        frames: numbers of the frames.
-    """
-
-    row: int
-    left: int
-    width: int
-    frames: list[int]
-
-
-@dataclass(frozen=True)
 class Gallery:
     """The pictures of one scene that were kept.
 
@@ -76,7 +59,7 @@ class Gallery:
         frame: that of the close-ups; ``None`` if there is no reference to compare with.
         thumbnail: that frame's reference, as a data URI.
         close_ups: by method, the same crops for each.
-        stripe: ``None`` if fewer than two frames were kept.
+        stripe: the row of pixels that temporal profiles show; ``None`` if fewer than two frames were kept.
         profiles: by method, as data URIs: one row of pixels for each frame.
         exposure: stops by which the reference is shown brighter, so that its typical pixel is a middle gray.
     """
@@ -87,7 +70,7 @@ class Gallery:
     frame: int | None
     thumbnail: str
     close_ups: dict[str, list[CloseUp]]
-    stripe: Stripe | None
+    stripe: Crop | None
     profiles: dict[str, str]
     exposure: float = 0.0
 
@@ -113,7 +96,7 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
     frame = max(files.get(REFERENCE, {}), default=None)
     close_ups, thumbnail = ({}, "") if frame is None else _close_ups(files, scene, frame, denoisers)
     stripe = _stripe(codes, factor, denoisers)
-    profiles = {} if stripe is None else {name: _profile(own, stripe, factor) for name, own in codes.items()}
+    whole = {name: own for name, own in codes.items() if list(own) == scene.pictures}
     return Gallery(
         scene,
         factor,
@@ -122,7 +105,7 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
         thumbnail,
         close_ups,
         stripe,
-        {name: picture for name, picture in profiles.items() if picture},
+        {} if stripe is None else {name: _profile(own, stripe, factor) for name, own in whole.items()},
         _exposure(codes.get(REFERENCE) or next(iter(codes.values()), {})),
     )
 
@@ -198,18 +181,15 @@ def _exposure(pictures: dict[int, Codes]) -> float:
     return min(max(round(4 * float(np.log2(_GRAY) - np.mean(means))) / 4, -8.0), 8.0) if means else 0.0
 
 
-def _stripe(codes: dict[str, dict[int, Codes]], factor: int, denoisers: set[str]) -> Stripe | None:
+def _stripe(codes: dict[str, dict[int, Codes]], factor: int, denoisers: set[str]) -> Crop | None:
     clips = [list(own.values()) for name, own in codes.items() if name in denoisers and len(own) > 1]
     if not clips:
         return None
     row, left, width = choose_row(clips)
-    frames = sorted({number for own in codes.values() for number in own})
-    return Stripe(row * factor, left * factor, width * factor, frames)
+    return Crop(left * factor, row * factor, width * factor, 1, "methods change most from frame to frame")
 
 
-def _profile(pictures: dict[int, Codes], stripe: Stripe, factor: int) -> str:
-    if set(pictures) != set(stripe.frames):
-        return ""
-    row, left, width = (length // factor for length in (stripe.row, stripe.left, stripe.width))
-    rows = np.stack([pictures[number][row, left : left + width] for number in stripe.frames])
+def _profile(pictures: dict[int, Codes], stripe: Crop, factor: int) -> str:
+    top, left, width = (length // factor for length in (stripe.top, stripe.left, stripe.width))
+    rows = np.stack([codes[top, left : left + width] for codes in pictures.values()])
     return data_uri(to_srgb(decode(rows).astype(np.float32)))
