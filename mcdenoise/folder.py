@@ -248,15 +248,7 @@ def denoised_frames(
     Raises:
         FrameError: see :func:`write_frames`.
     """
-    if denoiser.model is None:
-        denoiser.reset(frames=of or len(sequence))
-        denoiser.pick(sequence.first_valid_frame())
-    needs = denoiser.model.needs
-    wanted = needs.buffers | needs.uses
-    buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
-    denoiser.reset(buffers, of or len(sequence), sequence.size, len(sequence.lights))
-    denoiser.frames_stay, denoiser.warns = True, False
-    streaming = denoiser.has_history(buffers)
+    wanted, streaming = _begin(sequence, denoiser, reference, of or len(sequence))
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
@@ -290,6 +282,18 @@ def denoised_frames(
             if following is not None and denoiser.has_room_ahead and coming[0].exception() is None:
                 coming.append(reader.submit(read, following))
             yield denoised(coming.popleft(), number, waiting)
+
+
+def _begin(sequence: Sequence, denoiser: Denoiser, reference: bool, of: int) -> tuple[frozenset[str], bool]:
+    """Reset the denoiser; return the buffers that it uses, and whether it has a history."""
+    if denoiser.model is None:
+        denoiser.reset(frames=of)
+        denoiser.pick(sequence.first_valid_frame())
+    wanted = denoiser.model.needs.buffers | denoiser.model.needs.uses
+    buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
+    denoiser.reset(buffers, of, sequence.size, len(sequence.lights))
+    denoiser.frames_stay, denoiser.warns = True, False
+    return wanted, denoiser.has_history(buffers)
 
 
 def _pixels(image: Tensor) -> Image:
