@@ -36,16 +36,19 @@ if TYPE_CHECKING:
     from zarr import Array as ZarrArray
 
 SUFFIX = ".zip"
-# Channels and dtypes of the arrays. The arrays of a frame are [C, H, W, S], or [C, H, W] for the reference.
-_IMAGES = {
-    "color": (4, "|u1"),
-    "diffuse": (3, "<f2"),
-    "normal": (3, "<f2"),
-    "position": (3, "<f4"),
-    "motion": (3, "<f4"),
-    "reference": (3, "<f4"),
+# Shapes and dtypes of the arrays of a frame, with its height, width and number of samples.
+_ARRAYS = {
+    "color": ("4HWS", "|u1"),
+    "diffuse": ("3HWS", "<f2"),
+    "normal": ("3HWS", "<f2"),
+    "position": ("3HWS", "<f4"),
+    "motion": ("3HWS", "<f4"),
+    "reference": ("3HW", "<f4"),
+    "exposure": ("2", "<f4"),
+    "view_proj_mat": ("44", "<f4"),
+    "crop_offset": ("2", "<i4"),
 }
-_NUMBERS = {"exposure": ((2,), "<f4"), "view_proj_mat": ((4, 4), "<f4"), "crop_offset": ((2,), "<i4")}
+_IMAGES = {name for name, (shape, _) in _ARRAYS.items() if "H" in shape}
 # These arrays are redundant with `view_proj_mat`.
 _REDUNDANT = {"camera_position", "camera_target", "camera_up", "proj_mat"}
 # The array of each buffer that is read from a single array.
@@ -129,7 +132,7 @@ class _Arrays:
 
     def mean(self, name: str) -> Array:
         """``(C, H, W)`` mean over the samples, if there are several."""
-        if name == "reference":
+        if "S" not in _ARRAYS[name][0]:
             return self.whole(name)
         shape = self.array(name).shape
         total = np.zeros(shape[-4:-1])
@@ -223,7 +226,7 @@ class _NoisebaseFiles(FrameSequence):
 
     @property
     def unused(self) -> list[str]:
-        return sorted(self.shapes.keys() - _IMAGES.keys() - _NUMBERS.keys() - _REDUNDANT)
+        return sorted(self.shapes.keys() - _ARRAYS.keys() - _REDUNDANT)
 
     def _files(self, number: int) -> list[Path]:
         return [self.zips[number]]
@@ -244,7 +247,7 @@ class _NoisebaseFiles(FrameSequence):
         """Read means over samples: ``color``, features, and ``variance`` of the mean that the color is."""
         sampled = self.samples > 1 and (buffers is None or "samples" in buffers)
         samples = np.empty((self.samples, 3, *self.size), np.float32) if sampled else None
-        wanted = self.shapes.keys() & _IMAGES.keys() - {"color", *(() if reference else ("reference",))}
+        wanted = self.shapes.keys() & _IMAGES - {"color", *(() if reference else ("reference",))}
         with self.opened(number) as arrays:
             color, variance = arrays.radiance(samples)
             means = {name: arrays.mean(name) for name in wanted}
@@ -364,17 +367,16 @@ def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
         names = sorted(name.removesuffix("/.zarray") for name in file.namelist() if name.endswith("/.zarray"))
         if not {"color", "exposure"} <= set(names):
             raise _damaged(file, f"arrays {', '.join(names[:8]) or 'of no kind'} without 'color' and 'exposure'")
-        found = {name: arrays.array(name) for name in names if name in _IMAGES or name in _NUMBERS}
+        found = {name: arrays.array(name) for name in names if name in _ARRAYS}
         color = found["color"].shape
         lead = color[:-4]
         height, width, samples = color[-3:] if len(color) >= 4 else (0, 0, 0)
+        sides = {"H": height, "W": width, "S": samples}
         if len(lead) > 1 or not (0 < height * width <= LARGEST_PIXEL_COUNT and 0 < samples <= _LARGEST_SAMPLES):
             raise _damaged(file, f"'color' of shape {color}")
         for name, array in found.items():
-            shape, kind = (
-                ((_IMAGES[name][0], height, width, samples), _IMAGES[name][1]) if name in _IMAGES else _NUMBERS[name]
-            )
-            shape = (*lead, *(shape[:3] if name == "reference" else shape))
+            letters, kind = _ARRAYS[name]
+            shape = (*lead, *(sides.get(letter) or int(letter) for letter in letters))
             if array.shape != shape or array.dtype != np.dtype(kind):
                 raise _damaged(file, f"'{name}' of {array.dtype} {array.shape} beside 'color' {color}")
             _check_chunks(file, name, array)
