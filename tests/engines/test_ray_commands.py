@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import succeeds
 
-from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr
 
 ray = pytest.importorskip("ray", reason="clusters need Ray: pip install 'mcdenoise[ray]'")
 pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
 # Ray's own warnings; none is of this package.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("default"), pytest.mark.timeout(1200)]
-SMALL = ["--size", "24x16", "--variant", "scalar_rgb"]
 
 
 @pytest.fixture
@@ -30,12 +29,6 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     yield made, nodes
     ray.shutdown()
     made.shutdown()
-
-
-def run(*arguments: object) -> object:
-    with pytest.raises(SystemExit) as stop:
-        main([*map(str, arguments)])
-    return stop.value.code
 
 
 def lose(cluster: Any, out: Path, pattern: str) -> threading.Thread:
@@ -59,22 +52,11 @@ def same(one: Path, other: Path) -> bool:
 
 
 def test_generate(cluster: Any, tmp_path: Path) -> None:
-    options = [
-        "--assets",
-        "none",
-        "--seeds",
-        "0-3",
-        "--frames",
-        "3",
-        "--reference-spp",
-        "64",
-        "--noise-seeds",
-        "1",
-        *SMALL,
-    ]
-    assert not run("generate", "-o", tmp_path / "quiet", *options)
+    small = "--size 24x16 --variant scalar_rgb --frames 3 --reference-spp 64 --noise-seeds 1"
+    command = f"generate --assets none --seeds 0-3 {small} -o"
+    succeeds(f"{command} {tmp_path}/quiet")
     lost = lose(cluster, tmp_path / "out", "*/inputs/color0.exr")
-    assert not run("generate", "-o", tmp_path / "out", *options, "--workers", cluster[0].address)
+    succeeds(f"{command} {tmp_path}/out --workers {cluster[0].address}")
     lost.join(60)
     assert not lost.is_alive()
     assert same(tmp_path / "quiet", tmp_path / "out")

@@ -46,8 +46,8 @@ def mounted(place: Path, *options: str) -> Iterator[Path]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
-    [{}, {"HOME": "/proc/none"}, {"NUMBA_CACHE_DIR": "/dev/null"}, {"LC_ALL": "C"}],
-    ids=["no home", "a home that is nowhere", "a cache that is a file", "the C locale"],
+    [{}, {"HOME": "/proc/none", "NUMBA_CACHE_DIR": "/dev/null", "LC_ALL": "C"}],
+    ids=["no home", "a home that is nowhere, a cache that is a file, the C locale"],
 )
 def test_environments_without_much(environment: dict[str, str], tmp_path: Path) -> None:
     write_shot(tmp_path / "renders/ünï", 3)
