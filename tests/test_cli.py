@@ -167,18 +167,6 @@ def blur(radius=1):
     def filtered(color, albedo):
         return torch.nn.functional.avg_pool2d(color, 2 * radius + 1, 1, radius, count_include_pad=False)
     return Demodulated(Accumulated(filtered))
-
-def infinite():
-    return lambda color: color / 0
-
-def smaller():
-    return lambda color: color[..., 1:]
-
-def demanding():
-    return lambda color, roughness: color
-
-def nothing():
-    return 3
 """
 
 
