@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
@@ -28,8 +28,6 @@ from mcdenoise.suite import (
     write_close_ups,
 )
 
-__all__ = ["SHOWN", "score_suite"]
-
 
 def score_suite(
     data: Path,
@@ -45,6 +43,7 @@ def score_suite(
 ) -> int:
     """See :func:`mcdenoise.cli.benchmark.benchmark`; exit status 1 if a method failed on a row."""
     rows = choose_rows(patterns)
+    settings = replace(settings, sizes=(), pictures=1, metrics=SHOWN, memory=False)
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # Report errors in the choice of methods before hours of rendering.

@@ -17,7 +17,7 @@ from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops
 from mcdenoise.cli._options import Json, parse_size
 from mcdenoise.cli._output import print_rows, say, steps_of, warn, write_json
-from mcdenoise.cli._suite import SHOWN, score_suite
+from mcdenoise.cli._suite import score_suite
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
@@ -95,49 +95,9 @@ def benchmark(
     threads = torch.get_num_threads() if threads is None else threads
     check_threads(threads)
     command = _command_line({name: value for name, value in locals().items() if name != "json"})
-    if suite is not None:
-        if ops or sequences:
-            raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
-        if data is None:
-            raise InputError("--data: expected the folder of the suite's frames, found none; give one")
-        settings = Settings(
-            rounds=1 if rounds is None else rounds,
-            threads=threads,
-            device=device,
-            pictures=1,
-            metrics=SHOWN,
-            memory=False,
-            command=command,
-        )
-        return score_suite(
-            data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
-        )
-    if not ops and not sequences:
-        if out is None or not (out / FILE).exists():
-            raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
-        say(f"report: {write_report(out)}")
-        return 0
-    rounds = rounds if rounds is not None else 5 if ops else 3
-    if ops:
-        with steps_of("ops") as on_step:
-            costs = benchmark_ops(
-                size=parse_size(size),
-                rounds=rounds,
-                threads=threads,
-                device=device,
-                out=out,
-                command=command,
-                ops=find_ops([str(name) for name in sequences], OPS) if sequences else OPS,
-                on_step=on_step,
-            )
-        print_rows(op_rows(costs))
-        print(f"a copy moves {costs.bandwidth:.1f} GB/s, reading and writing")
-        write_json(json, asdict(costs))
-        return 0
-    if out is None:
-        raise InputError("--out: expected a folder to write to, found none; give one with -o")
-    if rounds < 1:
-        raise InputError(f"--rounds: expected at least 1, found {rounds}")
+    rounds = rounds if rounds is not None else 5 if ops else 1 if suite else 3
+    if ops and suite is None:
+        return _time_ops(sequences, parse_size(size), rounds, threads, device, out, command, json)
     settings = Settings(
         rounds=rounds,
         threads=threads,
@@ -148,6 +108,23 @@ def benchmark(
         pictures=pictures,
         command=command,
     )
+    if suite is not None:
+        if ops or sequences:
+            raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
+        if data is None:
+            raise InputError("--data: expected the folder of the suite's frames, found none; give one")
+        return score_suite(
+            data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
+        )
+    if not sequences:
+        if out is None or not (out / FILE).exists():
+            raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
+        say(f"report: {write_report(out)}")
+        return 0
+    if out is None:
+        raise InputError("--out: expected a folder to write to, found none; give one with -o")
+    if rounds < 1:
+        raise InputError(f"--rounds: expected at least 1, found {rounds}")
     check_packages()
     opened = [open_sequence(sequence, frames) for sequence in sequences]
     methods = choose_methods(models, precisions=precisions or "float32,bfloat16", keep_all=keep_all)
@@ -163,6 +140,33 @@ def benchmark(
         say(line)
     write_json(json, asdict(results))
     return 1 if results.failed else 0
+
+
+def _time_ops(
+    names: list[Path],
+    size: tuple[int, int],
+    rounds: int,
+    threads: int,
+    device: str,
+    out: Path | None,
+    command: str,
+    json: Json,
+) -> int:
+    with steps_of("ops") as on_step:
+        costs = benchmark_ops(
+            size=size,
+            rounds=rounds,
+            threads=threads,
+            device=device,
+            out=out,
+            command=command,
+            ops=find_ops([str(name) for name in names], OPS) if names else OPS,
+            on_step=on_step,
+        )
+    print_rows(op_rows(costs))
+    print(f"a copy moves {costs.bandwidth:.1f} GB/s, reading and writing")
+    write_json(json, asdict(costs))
+    return 0
 
 
 def _command_line(options: dict[str, Any]) -> str:

@@ -134,14 +134,13 @@ def _denoise(opened: Sequence, out: Path, shot: ShotSettings, json: Path | None,
     print(f"  precision: {denoiser.precision}, {report.precision}")
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
-    absent = {name for done in report.frames.values() for name in done.missing}
-    if (missing := sorted(absent - (MOTION if len(opened) == 1 else frozenset()))) and {
-        "albedo",
-        "normal",
-        "depth",
-    } & opened.buffers:
-        say(f"without {', '.join(missing)}, with which {report.model} is better")
-    if not {"albedo", "normal", "depth"} & opened.buffers:
+    features = {"albedo", "normal", "depth"} & opened.buffers
+    missing = {name for done in report.frames.values() for name in done.missing} - (
+        MOTION if len(opened) == 1 else set()
+    )
+    if missing and features:
+        say(f"without {', '.join(sorted(missing))}, with which {report.model} is better")
+    if not features:
         # Said last but for warnings, where it is seen.
         say("NO FEATURES: turn on the passes albedo, normal and depth in the renderer; with them it is far better")
     warn(report.warnings)
