@@ -92,7 +92,7 @@ class TunedNetwork(nn.Module):
             fraction = torch.full_like(exposure, fixed)
         else:
             level, spread = noise_of(frame.color, frame.albedo, frame.normal)
-            fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1) - _SPREAD * spread).clamp_min(0)
+            fraction = ((_MOST - _FALL * level).clamp(_LEAST, 1.0) - _SPREAD * spread).clamp_min(0)
         return {"oidn_exposure": exposure, "start_fraction": fraction * self.kept}
 
     def keep_start(self) -> None:
