@@ -1,83 +1,145 @@
-"""The add-on for Blender, where there is a Blender: the variable BLENDER_PYTHON names an interpreter with `bpy`."""
+"""The extension for Blender: it reads files as the package does, and its zip works in a Blender that is there."""
 
+import importlib.util
 import os
-import shutil
 import subprocess
 import sys
+import types
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import OpenImageIO
+import OpenImageIO as oiio
 import pytest
+from commands import succeeds
+
+from mcdenoise.data import open_sequence
 
 ROOT = Path(__file__).resolve().parents[1]
-ADDON = ROOT / "examples" / "blender" / "denoise_animation.py"
-RENDERED = ROOT / "tests" / "data" / "renderers" / "blender_filtered"
+EXTENSION = ROOT / "extensions" / "blender"
+RENDERED = ROOT / "tests" / "data" / "renderers"
 PYTHON = os.environ.get("BLENDER_PYTHON")
-# The command is a script in the folder of this interpreter.
-PROGRAM = Path(sys.executable).with_name("mcdenoise")
-
-SCRIPT = f"""
-import importlib.util, os, sys
-spec = importlib.util.spec_from_file_location("denoise_animation", {str(ADDON)!r})
-addon = sys.modules["denoise_animation"] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(addon)
-import bpy
-addon.register()
-scene = bpy.context.scene
-if bpy.app.version >= (5, 0):
-    scene.render.image_settings.media_type = "MULTI_LAYER_IMAGE"
-scene.render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
-scene.render.filepath, last = sys.argv[1], int(sys.argv[2])
-scene.frame_start, scene.frame_end = 7, last
-scene.denoise_animation.arguments = " ".join(sys.argv[3:])
-print(addon.pattern(scene))
-print(bpy.ops.render.denoise_animation())
-addon.unregister()
-"""
+# Of two frames with all passes, in one part and in one for each pass.
+SHOTS = {"blender": "ViewLayer", "blender5": "ViewLayer"}
 
 
-def run_addon(folder: Path, *arguments: str, program: Path = PROGRAM) -> subprocess.CompletedProcess[str]:
-    if PYTHON is None:
-        pytest.skip("no BLENDER_PYTHON")
-    # Blender's interpreter has nothing to do with where mcdenoise is installed.
-    command = [PYTHON, "-c", SCRIPT, str(folder / "shot_"), *arguments]
-    environment = {**os.environ, "MCDENOISE": str(program)}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+@pytest.fixture(scope="module")
+def frames() -> Any:
+    return loaded(EXTENSION / "frames.py")
 
 
-@pytest.fixture
-def shot(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(RENDERED, tmp_path / "my shot"))
+def loaded(path: Path) -> types.ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
-def test_addon_denoises_what_was_rendered(shot: Path) -> None:
-    done = run_addon(shot, "8")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.splitlines()[0] == "shot_####.exr"
-    assert done.stdout.splitlines()[-1] == "{'FINISHED'}"
-    for name in ("shot_0007.exr", "shot_0008.exr"):
-        before, after = (OpenImageIO.ImageBuf(str(folder / name)) for folder in (shot, shot / "denoised"))
-        assert after.spec().channelnames == before.spec().channelnames
-        color = [image.get_pixels(OpenImageIO.FLOAT)[..., :3] for image in (before, after)]
-        roughness = [np.mean(np.abs(np.diff(np.log1p(np.maximum(image, 0)), axis=1))) for image in color]
-        assert roughness[1] < 0.9 * roughness[0]
+@pytest.mark.parametrize("shot", SHOTS)
+def test_buffers_are_read_as_by_the_package(shot: str, frames: Any, tmp_path: Path) -> None:
+    source = sorted((RENDERED / shot).glob("*.exr"))[-1]
+    sequence = open_sequence(RENDERED / shot)
+    frame = sequence.frame(sequence.numbers[-1]).validate()[0]
+    seen: dict[str, Any] = {}
+
+    def denoise(buffers: dict[str, Any]) -> Any:
+        seen.update(buffers)
+        return 2 * buffers["color"]
+
+    frames.denoise_frame(denoise, source, tmp_path / "out" / "new.exr", SHOTS[shot])
+    for name, image in seen.items():
+        expected = getattr(frame, name)[0].permute(1, 2, 0).numpy()
+        np.testing.assert_allclose(image, expected, rtol=1e-6, atol=1e-6, err_msg=name)
+    # Twice the noisy light, and everything else as it was.
+    before, after = (parts(path) for path in (source, tmp_path / "out" / "new.exr"))
+    assert before.keys() == after.keys()
+    for name, image in before.items():
+        place = "RGB".find(name[-1]) if ".Combined." in name else -1
+        expected = image if place < 0 else 2 * seen["color"][..., place]
+        np.testing.assert_array_equal(after[name], expected, err_msg=name)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["new.exr"]
+
+
+def parts(path: Path) -> dict[str, Any]:
+    """Pixels of every channel of every part."""
+    file, found = oiio.ImageInput.open(str(path)), {}
+    while file.seek_subimage(file.current_subimage() + bool(found), 0):
+        pixels = file.read_image(file.current_subimage(), 0, 0, file.spec().nchannels, "float")
+        found |= {name: pixels[..., i] for i, name in enumerate(file.spec().channelnames)}
+    return found
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("9",), "shot_0009.exr is not there; render the animation first, or change the frame range"),
-        (("8", "--model", "nosuch"), "nosuch"),
-    ],
+    ("name", "layer", "expected"),
+    [("shot_0007.exr", "Another", "pass Combined"), ("shot_0009.exr", "Main Layer v1.2", "cannot be read")],
 )
-def test_addon_says_in_one_line_what_is_wrong(shot: Path, arguments: tuple[str, ...], expected: str) -> None:
-    done = run_addon(shot, *arguments)
-    assert done.returncode != 0
-    assert expected in done.stderr
-    assert not (shot / "denoised").exists()
+def test_what_cannot_be_denoised_is_said_in_one_line(
+    name: str, layer: str, expected: str, frames: Any, tmp_path: Path
+) -> None:
+    with pytest.raises(frames.FrameError) as error:
+        frames.denoise_frame(
+            lambda buffers: buffers["color"], RENDERED / "blender_filtered" / name, tmp_path / "x.exr", layer
+        )
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
 
 
-def test_addon_says_where_to_name_the_program(shot: Path) -> None:
-    done = run_addon(shot, "8", program=shot / "nothing")
-    assert "name mcdenoise in the preferences" in done.stderr
+SCRIPT = """
+import sys
+import bpy
+archive, rendered, first, last, layer = sys.argv[1:]
+bpy.ops.preferences.addon_enable(module="bl_pkg")
+bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
+scene = bpy.context.scene
+for step in ("passes", "animation"):
+    if step == "animation":
+        bpy.context.view_layer.name = layer
+        scene.render.filepath = rendered
+        scene.frame_start, scene.frame_end = int(first), int(last)
+    try:
+        print(step, getattr(bpy.ops.render, f"denoise_{step}")())
+    except RuntimeError as error:
+        print(step, error)
+bpy.ops.preferences.addon_disable(module="bl_ext.user_default.mcdenoise")
+"""
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if PYTHON is None:
+        pytest.skip("no BLENDER_PYTHON")
+    out = tmp_path_factory.mktemp("built") / "extension.zip"
+    subprocess.run([sys.executable, EXTENSION / "build.py", "-o", out], check=True, timeout=1800)
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_the_zip_denoises_in_blender_as_the_command_does(archive: Path, tmp_path: Path) -> None:
+    assert archive.stat().st_size < 60e6
+    with zipfile.ZipFile(archive) as file:
+        assert {"blender_manifest.toml", "__init__.py", "frames.py", "model.onnx"} < set(file.namelist())
+    render = ROOT / "examples" / "blender" / "render.py"
+    shot = tmp_path / "my shot"
+    subprocess.run([PYTHON, render, "-o", shot, "--size", "96x64", "--frames", "4", "--samples", "2"], check=True)
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "blender")}
+
+    def run(last: str) -> list[str]:
+        command = [str(PYTHON), "-c", SCRIPT, str(archive), str(shot / "shot_"), "1", last, "ViewLayer"]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        return [line for line in done.stdout.splitlines() if line.startswith(("passes", "animation"))] or [done.stderr]
+
+    assert run("4") == ["passes {'FINISHED'}", "animation {'FINISHED'}"]
+    succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", "--model", "oidn_tuned", "--keep-all")
+    for number in range(1, 5):
+        found, expected = (parts(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out"))
+        for letter in "RGB":
+            name = f"ViewLayer.Combined.{letter}"
+            error = np.abs(found[name] - expected[name]) / (np.abs(expected[name]) + expected[name].mean())
+            assert error.max() < 1e-2, (number, letter)
+            assert error.mean() < 1e-3, (number, letter)
+    assert "shot_0005.exr is not there" in run("5")[1]

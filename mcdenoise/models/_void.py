@@ -77,7 +77,7 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
         void = empty if void is None else void | empty
         if alpha is not None and frame.hints.alpha:
             divided = covers
-            frame = _divided(frame, torch.where(covers, alpha.clamp(_LEAST, 1), 1))
+            frame = _divided(frame, torch.where(covers, alpha.clamp(_LEAST, 1.0), 1))
     if void is None or (known and not void.any()):
         return frame, Void(None, divided)
     source = _mirrored(void)
@@ -113,7 +113,7 @@ def with_void(output: Output, frame: Frame, void: Void) -> Output:
         if void.divided is not None:
             # A glow where no surface is keeps its light.
             surface = (alpha > 0) if mask is None else (alpha > 0) | mask
-            multiplier = torch.where(surface, after, alpha).clamp(_LEAST, 1)
+            multiplier = torch.where(surface, after, alpha).clamp(_LEAST, 1.0)
             multiplier = torch.where(void.divided, multiplier, 1)
             output = _light(output, lambda image: image * multiplier)
             # A pixel that only noise left empty has the light of the surface.

@@ -47,7 +47,7 @@ def samples_of(frame: Frame) -> Tensor:
             "the first three are radiance"
         )
     # ``Frame.validate`` does not check every value of the samples.
-    light = frame.samples[:, :, :3].nan_to_num(0).clamp(0, LARGEST_RADIANCE)
+    light = frame.samples[:, :, :3].nan_to_num(0).clamp(0.0, LARGEST_RADIANCE)
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 

@@ -25,7 +25,7 @@ def compress(radiance: Tensor) -> Tensor:
     Denoise: ``a y`` up to y0, ``b y^c + d`` up to y1, ``e log(y + f) + g`` above, over its value at 65504.
     """
     (b, c, d), (e, f, g), (y0, y1, _, _) = PU_MIDDLE, PU_BRIGHT, PU_JOINTS
-    y = radiance.clamp(0, MAX_RADIANCE)
+    y = radiance.clamp(0.0, MAX_RADIANCE)
     power = b * y.clamp_min(y0).pow(c) + d
     return torch.where(y <= y0, PU_DARK * y, torch.where(y <= y1, power, e * torch.log(y + f) + g)) / PU_WHITE
 

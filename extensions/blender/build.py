@@ -1,0 +1,57 @@
+"""Build the Blender extension as a zip: the graph of a model, the wheel of onnxruntime, and the code beside this file.
+
+    python extensions/blender/build.py -o build/mcdenoise-blender.zip
+
+The zip is for the processor and system that it is built on, and for Blender from 4.2 on, whose Python is 3.11.
+"""
+
+import argparse
+import platform
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+from mcdenoise.data.files import atomic_path
+from mcdenoise.denoiser import FILTERED
+from mcdenoise.export import export_model
+from mcdenoise.models import create_model
+
+HERE = Path(__file__).parent
+# The model that the command picks for the frames of a renderer.
+MODEL, BUFFERS = FILTERED, ("color", "albedo", "normal", "depth", "motion")
+WHEEL, PYTHON = "onnxruntime==1.22.0", "3.11"
+PLATFORMS = {("Linux", "x86_64"): "linux-x64", ("Windows", "AMD64"): "windows-x64", ("Darwin", "arm64"): "macos-arm64"}
+
+
+def main() -> None:
+    """Build the zip that the arguments name."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--out", type=Path, required=True, help="the zip to write")
+    parser.add_argument("--model", default=MODEL, help="a model with shipped weights, see `mcdenoise models`")
+    asked = parser.parse_args()
+    here = (platform.system(), platform.machine())
+    if here not in PLATFORMS:
+        sys.exit(f"build.py: expected one of {', '.join(map(' '.join, PLATFORMS))}, found {' '.join(here)}")
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as name, atomic_path(asked.out) as temporary:
+        folder = Path(name)
+        download = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:"]
+        subprocess.run([*download, "--python-version", PYTHON, "-d", folder, WHEEL], check=True)
+        export_model(
+            create_model(asked.model, pretrained=True), folder / "model.onnx", buffers=BUFFERS, name=asked.model
+        )
+        (wheel,) = folder.glob("*.whl")
+        manifest = (HERE / "blender_manifest.toml").read_text()
+        added = f'platforms = ["{PLATFORMS[here]}"]\nwheels = ["./wheels/{wheel.name}"]\n\n[permissions]'
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as file:
+            file.writestr("blender_manifest.toml", manifest.replace("[permissions]", added))
+            file.write(wheel, f"wheels/{wheel.name}")
+            for path in (folder / "model.onnx", HERE / "__init__.py", HERE / "frames.py"):
+                file.write(path, path.name)
+    print(f"{asked.out}: {asked.out.stat().st_size / 1e6:.0f} MB, for Blender on {PLATFORMS[here]}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Denoising of multilayer EXR files by a graph in ONNX, with numpy, onnxruntime and OpenImageIO only."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+MODEL = Path(__file__).with_name("model.onnx")
+# The passes of each buffer, the preferred one first, and their channels.
+PASSES = {
+    "color": (("Noisy Image", "Combined"), "RGB"),
+    "albedo": (("Denoising Albedo",), "RGB"),
+    "normal": (("Denoising Normal",), "XYZ"),
+    "depth": (("Depth", "Z"), "Z"),
+    "motion": (("Vector",), "XY"),
+}
+RESULT = "Combined"
+# Blender writes 1e10 where no surface is.
+_FARTHEST, _BRIGHTEST = 1e9, 1e16
+
+
+class FrameError(Exception):
+    """A file cannot be read, lacks a pass, or cannot be written: one line."""
+
+
+class Denoiser:
+    """Denoises the frames of a shot one after the other, and keeps the graph's state between them.
+
+    Args:
+        threads: CPU threads; 0 for onnxruntime's choice.
+    """
+
+    def __init__(self, threads=0):
+        import onnxruntime  # imported here because it takes as long as a frame
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.log_severity_level = threads, 3
+        self._session = onnxruntime.InferenceSession(str(MODEL), options, providers=["CPUExecutionProvider"])
+        self._outputs = [each.name for each in self._session.get_outputs()]
+        self._state = {}
+
+    def __call__(self, buffers):
+        """The denoised radiance ``(H, W, 3)`` of buffers ``(H, W, C)`` by name, float32."""
+        feeds = {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in buffers.items()}
+        sizes = {}
+        for given in self._session.get_inputs():
+            # All sizes of a state are sizes of the image, or numbers.
+            shape = feeds[given.name].shape if given.name in feeds else [sizes.get(each, each) for each in given.shape]
+            sizes |= dict(zip(given.shape, shape, strict=True))
+            state = self._state.get(given.name)
+            if given.name not in feeds:
+                feeds[given.name] = (
+                    state if state is not None and state.shape == tuple(shape) else np.zeros(shape, "f4")
+                )
+        feeds = {each.name: feeds[each.name] for each in self._session.get_inputs()}
+        image, *after = self._session.run(self._outputs, feeds)
+        self._state = {name.removeprefix("next_"): each for name, each in zip(self._outputs[1:], after, strict=True)}
+        return image[0].transpose(1, 2, 0)
+
+
+def denoise_frame(denoise, source, target, layer):
+    """Write a copy of a multilayer EXR whose Combined is denoised; everything else is unchanged.
+
+    Args:
+        denoise: a :class:`Denoiser`.
+        source: the rendered file.
+        target: the file to write; its folder exists.
+        layer: name of the view layer.
+
+    Raises:
+        FrameError: the file cannot be read, lacks a pass of :data:`PASSES`, or the other cannot be written.
+    """
+    parts = _read(source)
+    image = denoise(_buffers(source, parts, layer))
+    if not np.isfinite(image).all():
+        raise FrameError(f"{source}: the result is not finite")
+    pixels, places = _channels(source, parts, layer, RESULT, "RGB")
+    pixels[..., places] = image
+    _write(target, parts)
+
+
+def _read(path):
+    """Specification and pixels of each part."""
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        raise FrameError(f"{path}: cannot be read: {oiio.geterror()}")
+    parts = []
+    while file.seek_subimage(len(parts), 0):
+        pixels = file.read_image(len(parts), 0, 0, file.spec().nchannels, "float")
+        if pixels is None:
+            raise FrameError(f"{path}: cannot be read: {file.geterror()}")
+        parts.append((oiio.ImageSpec(file.spec()), np.asarray(pixels, np.float32)))
+    file.close()
+    return parts
+
+
+def _channels(path, parts, layer, name, letters):
+    """The pixels of the part with a pass of a view layer, and the places of its channels."""
+    for spec, pixels in parts:
+        wanted = [f"{layer}.{name}.{letter}" for letter in letters]
+        if set(wanted) <= set(spec.channelnames):
+            return pixels, [spec.channelnames.index(each) for each in wanted]
+    raise FrameError(f"{path}: expected the pass {name} of the view layer {layer}, found none; render with it")
+
+
+def _buffers(path, parts, layer):
+    found = {}
+    for buffer, (names, letters) in PASSES.items():
+        for name in names:
+            try:
+                pixels, places = _channels(path, parts, layer, name, letters)
+            except FrameError:
+                if name == names[-1]:
+                    raise
+            else:
+                found[buffer] = pixels[..., places]
+                break
+    depth = found["depth"]
+    found["depth"] = np.where(np.isfinite(depth) & (depth < _FARTHEST), depth, np.inf).astype(np.float32)
+    found["color"] = np.nan_to_num(found["color"], nan=0, posinf=_BRIGHTEST, neginf=0).clip(0, _BRIGHTEST)
+    found["albedo"] = np.nan_to_num(found["albedo"]).clip(0, 1)
+    found["normal"] = np.nan_to_num(found["normal"]).clip(-1, 1)
+    # Blender's y points up, and a background, whose motion is unknown, has zeros.
+    motion = found["motion"] * np.float32([1, -1])
+    known = np.isfinite(motion) & (np.isfinite(found["depth"]) | (motion != 0))
+    found["motion"] = np.where(known, motion, np.float32(np.inf))
+    return found
+
+
+def _write(path, parts):
+    """Write all parts atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp.exr")
+    file = oiio.ImageOutput.create(str(temporary))
+    specs = tuple(spec for spec, _ in parts)
+    try:
+        if not file.open(str(temporary), specs if len(specs) > 1 else specs[0]):
+            raise FrameError(f"{path}: cannot be written: {file.geterror()}")
+        for number, (spec, pixels) in enumerate(parts):
+            if number and not file.open(str(temporary), spec, "AppendSubimage"):
+                raise FrameError(f"{path}: cannot be written: {file.geterror()}")
+            if not file.write_image(pixels):
+                raise FrameError(f"{path}: cannot be written: {file.geterror()}")
+        if not file.close():
+            raise FrameError(f"{path}: cannot be written: {file.geterror()}")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
