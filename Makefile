@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint format clean
+.PHONY: help demo test docs blender lint format clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -20,6 +20,9 @@ test: $(VENV)/.stamp-dev ## run every test that is not marked slow or attack, on
 docs: $(VENV)/.stamp-fast,oidn,docs ## build the documentation as a site that opens from disk: build/site/index.html
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
+
+blender: $(VENV)/.stamp-export ## build the extension for Blender: build/mcdenoise-blender.zip
+	$(BIN)/python extensions/blender/build.py -o build/mcdenoise-blender.zip
 
 lint: $(VENV)/.stamp-dev ## check style, format and types; change nothing
 	$(BIN)/ruff check

@@ -112,7 +112,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
             self.report({"ERROR"}, f"{self.output} has the rendered files; choose another folder")
             return False
         self.files = [(path, self.output / path.name) for path in rendered]
-        self.layer = context.view_layer.name
+        self.layer, self.blurred = context.view_layer.name, scene.render.use_motion_blur
         return True
 
     def run(self):
@@ -123,7 +123,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
             for source, target in self.files:
                 if self.stopped.is_set():
                     return
-                frames.denoise_frame(denoise, source, target, self.layer)
+                frames.denoise_frame(denoise, source, target, self.layer, blurred=self.blurred)
                 self.done.put(target)
         except (frames.FrameError, OSError) as error:
             self.failed.append(str(error))

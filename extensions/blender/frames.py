@@ -59,7 +59,7 @@ class Denoiser:
         return image[0].transpose(1, 2, 0)
 
 
-def denoise_frame(denoise, source, target, layer):
+def denoise_frame(denoise, source, target, layer, *, blurred=False):
     """Write a copy of a multilayer EXR whose Combined is denoised; everything else is unchanged.
 
     Args:
@@ -67,12 +67,16 @@ def denoise_frame(denoise, source, target, layer):
         source: the rendered file.
         target: the file to write; its folder exists.
         layer: name of the view layer.
+        blurred: whether there is motion blur, with which Blender's Vector has zeros: then a frame is denoised alone.
 
     Raises:
         FrameError: the file cannot be read, lacks a pass of :data:`PASSES`, or the other cannot be written.
     """
     parts = _read(source)
-    image = denoise(_buffers(source, parts, layer))
+    buffers = _buffers(source, parts, layer)
+    if blurred:
+        buffers["motion"] = np.full_like(buffers["motion"], np.inf)
+    image = denoise(buffers)
     if not np.isfinite(image).all():
         raise FrameError(f"{source}: the result is not finite")
     pixels, places = _channels(source, parts, layer, RESULT, "RGB")
