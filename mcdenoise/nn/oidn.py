@@ -161,7 +161,8 @@ def _binned(image: Tensor, axis: int) -> Tensor:
     side = image.shape[axis]
     count = -(-side // _BIN)
     edges = torch.arange(count + 1, device=image.device) * side // count
-    part = torch.searchsorted(edges[1:], torch.arange(side, device=image.device), right=True)
+    # The part between whose edges a pixel lies: i >= floor(b side / count) if and only if b < (i + 1) count / side.
+    part = (torch.arange(1, side + 1, device=image.device) * count - 1) // side
     shape = [size if each != axis else count for each, size in enumerate(image.shape)]
     sizes = edges.diff().reshape([-1 if each == axis else 1 for each in range(4)])
     return image.new_zeros(shape).index_add(axis, part, image) / sizes
