@@ -92,7 +92,9 @@ def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> 
         size = image.shape[dim]
         # A graph for any image size cannot branch on it.
         if torch.compiler.is_compiling() or size < max(before, after):
-            place = torch.arange(-before, size + after, device=image.device) % (2 * size)
+            place = torch.arange(-before, size + after, device=image.device)
+            # Graphs in ONNX divide by no number that is a size.
+            place = place % torch.full_like(place, 2 * size)
             image = image.index_select(dim, torch.where(place < size, place, 2 * size - 1 - place))
         elif before or after:
             # In a fifth of the time.
