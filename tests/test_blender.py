@@ -90,7 +90,10 @@ def test_what_cannot_be_denoised_is_said_in_one_line(
 
 SCRIPT = """
 import sys
+from pathlib import Path
 import bpy
+# As a module, Blender does not look where its own packages are.
+sys.path += map(str, Path(bpy.utils.resource_path("LOCAL")).glob("python/lib/python*/site-packages"))
 archive, rendered, first, last, layer = sys.argv[1:]
 bpy.ops.preferences.addon_enable(module="bl_pkg")
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)

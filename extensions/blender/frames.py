@@ -4,7 +4,11 @@ import os
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
+
+try:
+    from OpenImageIO import OpenImageIO as oiio  # Blender has the module in a folder of that name
+except ImportError:
+    import OpenImageIO as oiio
 
 MODEL = Path(__file__).with_name("model.onnx")
 # The passes of each buffer, the preferred one first, and their channels.
