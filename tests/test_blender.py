@@ -137,12 +137,15 @@ def test_the_zip_denoises_in_blender_as_the_command_does(archive: Path, tmp_path
         return [line for line in done.stdout.splitlines() if line.startswith(("passes", "animation"))] or [done.stderr]
 
     assert run("4") == ["passes {'FINISHED'}", "animation {'FINISHED'}"]
-    succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", "--model", "oidn_tuned", "--keep-all")
+    # The graph compares surfaces by their depth.
+    same = ("--model", "oidn_tuned", "--keep-all", "--map", "position=")
+    succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", *same)
     for number in range(1, 5):
         found, expected = (parts(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out"))
         for letter in "RGB":
             name = f"ViewLayer.Combined.{letter}"
             error = np.abs(found[name] - expected[name]) / (np.abs(expected[name]) + expected[name].mean())
-            assert error.max() < 1e-2, (number, letter)
-            assert error.mean() < 1e-3, (number, letter)
+            # Both were rounded to half floats.
+            assert error.max() < 2e-3, (number, letter)
+            assert error.mean() < 1e-5, (number, letter)
     assert "shot_0005.exr is not there" in run("5")[1]

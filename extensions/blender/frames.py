@@ -129,9 +129,9 @@ def _buffers(path, parts, layer):
     found["color"] = np.nan_to_num(found["color"], nan=0, posinf=_BRIGHTEST, neginf=0).clip(0, _BRIGHTEST)
     found["albedo"] = np.nan_to_num(found["albedo"]).clip(0, 1)
     found["normal"] = np.nan_to_num(found["normal"]).clip(-1, 1)
-    # Blender's y points up, and a background, whose motion is unknown, has zeros.
+    # Blender's y points up, and where something moves, a background has zeros, as its motion is unknown.
     motion = found["motion"] * np.float32([1, -1])
-    known = np.isfinite(motion) & (np.isfinite(found["depth"]) | (motion != 0))
+    known = np.isfinite(motion) & (np.isfinite(found["depth"]) | (motion != 0) | ~motion.any())
     found["motion"] = np.where(known, motion, np.float32(np.inf))
     return found
 
