@@ -37,11 +37,14 @@ def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
     return op
 
 
+# Those with 25 or more taps, or all pixels, at each of many cases take half a minute.
+SLOW = ("affinity_filter", "atrous", "moments_variance", "temporal_gradient")
+
+
 # bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes and cases.
 @pytest.mark.parametrize(
     "op",
-    # Those with 25 or more taps at each of many cases take half a minute.
-    [pytest.param(op, marks=[pytest.mark.slow] if op.name in ("atrous", "moments_variance") else []) for op in OPS],
+    [pytest.param(op, marks=[pytest.mark.slow] if op.name in SLOW else []) for op in OPS],
     ids=lambda op: op.name,
 )
 def test_every_op_is_stable(op: Op) -> None:
