@@ -37,7 +37,23 @@ NAMES = [
         "\x9b31m",
         "a\tb",
     ),
-    *("a:b", "~", "a\\b", "null", "1", "inputs", "color0.exr", "e\u0301", "\r", "#", "{}", "%s%n", "=", ","),
+    # A user that there is not: ~ alone is the own folder.
+    *(
+        "a:b",
+        "~nobody of this name",
+        "a\\b",
+        "null",
+        "1",
+        "inputs",
+        "color0.exr",
+        "e\u0301",
+        "\r",
+        "#",
+        "{}",
+        "%s%n",
+        "=",
+        ",",
+    ),
 ]
 # Names that are options on a command line, where such a folder must be written as `./-o`.
 OPTIONS = {"-o", "--json"}
