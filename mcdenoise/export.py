@@ -175,7 +175,8 @@ def export_model(
     The inputs are the buffers by name and the tensors of the state as ``state.NAME``; the outputs are ``image`` and
     ``next_state.NAME``. Begin a shot with a state of zeros, and pass each frame the state that the previous one
     returned. Batch size, height and width are free. Frames must be valid: :meth:`mcdenoise.frame.Frame.validate`
-    repairs NaN, infinite and negative values of ``color``.
+    repairs NaN, infinite and negative values of ``color``. In ONNX the free axes are named ``batch``, ``height`` and
+    ``width``; a state of a coarser resolution has axes of other names.
 
     Args:
         model: the method; it runs in float32 on the CPU while it is traced.
@@ -291,6 +292,17 @@ def _write_onnx(
     if written is None:
         raise InputError("model: expected a graph that ONNX has operators for, found another")
     written.model.metadata_props.update(about)
+    # The exporter numbers the sizes that are free; those of the color have names.
+    graph: Any = written.model.graph
+    color = next(each.shape for each in graph.inputs if each.name == "color")
+    known = {str(size): name for size, name in zip(color, ("batch", "", "height", "width"), strict=True) if name}
+    for each in (*graph.inputs, *graph.outputs):
+        for axis, size in enumerate(each.shape):
+            each.shape[axis] = known.get(str(size), size)
+    # A state goes in as it came out.
+    after = {each.name.removeprefix("next_"): each.shape for each in graph.outputs}
+    for each in graph.inputs:
+        each.shape = after.get(each.name, each.shape)
     written.save(path, external_data=False)
 
 

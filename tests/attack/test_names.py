@@ -86,6 +86,8 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
     # Images, zip files and manifests are recognized by their extension.
     suffix = Path(part).suffix if part.startswith(("still", "frame", "film.")) else ""
     for given in (each + suffix for each in NAMES if len(os.fsencode(each + suffix)) <= 255):
+        if part == "out" and given.endswith(".exr"):
+            continue  # that is a file, not a folder
         folder = attacker.fresh(command.needs)
         if (folder / part).exists():
             (folder / part).rename(folder / given)
