@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 from collections.abc import Callable
@@ -121,7 +122,7 @@ def run_demo(
 def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tuple[Path, list[Score]]:
     """Several methods on the frames of the demonstration; the folder of the results, and the errors."""
     folder, threads = out / "report", torch.get_num_threads()
-    if (folder / FILE).exists():
+    if os.path.exists(folder / FILE):
         shutil.rmtree(folder)
     settings = Settings(
         rounds=1,

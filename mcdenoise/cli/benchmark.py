@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -117,7 +118,7 @@ def benchmark(
             data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
         )
     if not sequences:
-        if out is None or not (out / FILE).exists():
+        if out is None or not os.path.exists(out / FILE):
             raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
         say(f"report: {write_report(out)}")
         return 0

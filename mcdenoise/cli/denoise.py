@@ -61,7 +61,7 @@ def denoise(
     if shot.threads is not None:
         torch.set_num_threads(shot.threads)
     opened = shot.open(_by_buffer(inputs, albedo, normal))
-    if out.suffix.lower() not in FORMATS or out.is_dir():
+    if out.suffix.lower() not in FORMATS or os.path.isdir(out):
         _denoise(opened, out, shot, json)
         return
     if len(opened) > 1 or shot.preview:

@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import math
+import os
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -127,7 +128,7 @@ def find_shards(path: Path) -> list[Path]:
     """The packed takes in a folder, or the one that the path is; none if it is something else."""
     if path.name.endswith(SUFFIX):
         return [path]
-    return sorted(path.glob(f"[!.]*{SUFFIX}")) if path.is_dir() else []
+    return sorted(path.glob(f"[!.]*{SUFFIX}")) if os.path.isdir(path) else []
 
 
 def _shape(name: str, shape: Any) -> tuple[int, int, int, int]:
