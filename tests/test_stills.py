@@ -49,6 +49,16 @@ def test_a_file_is_denoised_to_a_file_of_any_format(
     np.testing.assert_allclose(read(out), expected, rtol=relative, atol=absolute)
 
 
+def test_the_result_is_not_rounded_as_its_input_was(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    """Nor are files taken for frames of one shot whose names differ in zeros only."""
+    noisy, albedo, out = tmp_path / "x_01.png", tmp_path / "x_1.png", tmp_path / "out.pfm"
+    write_radiance(noisy, buffers["x"])
+    write_radiance(albedo, buffers["y"])
+    succeeds("denoise", noisy, "--albedo", albedo, "--model", "joint_bilateral", "-o", out)
+    expected = denoise(read(noisy), albedo=read(albedo), model="joint_bilateral")
+    np.testing.assert_allclose(read(out), expected, rtol=1e-5)
+
+
 def test_the_layers_of_a_file_are_kept(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
     noisy, out = tmp_path / "noisy.exr", tmp_path / "clean.exr"
     names = [*"RGB", *("albedo.R", "albedo.G", "albedo.B")]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from collections.abc import Sequence as Sequential
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -12,13 +13,15 @@ from typing import Any
 
 import torch
 import tyro
+from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.cli._options import Inputs, Json, Out
 from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_of, warn, write_json
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
-from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.data import Sequence
+from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import make_folder
 from mcdenoise.data.images import FORMATS
 from mcdenoise.data.radiance import write_radiance
@@ -71,12 +74,13 @@ def denoise(
         raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
     make_folder(out.parent)
     with tempfile.TemporaryDirectory(prefix=".denoised-", dir=out.parent) as folder:
-        written = _denoise(opened, Path(folder), shot, json, shown=out)
+        images: list[Tensor] = []
+        written = _denoise(opened, Path(folder), shot, json, out, lambda name, image, metadata: images.append(image))
         if FORMATS.get(written.suffix.lower()) == FORMATS[out.suffix.lower()]:
             written.replace(out)
         else:
-            result = open_sequence([written])
-            write_radiance(out, result.frame(result.numbers[0]).color[0].permute(1, 2, 0).numpy())
+            # Not what the copy of the input holds, which may have been rounded to its type.
+            write_radiance(out, images[0][0].permute(1, 2, 0).float().cpu().numpy())
 
 
 def _by_buffer(
@@ -91,7 +95,14 @@ def _by_buffer(
     return {"color": inputs[0], **features}
 
 
-def _denoise(opened: Sequence, out: Path, shot: ShotSettings, json: Path | None, shown: Path | None = None) -> Path:
+def _denoise(
+    opened: Sequence,
+    out: Path,
+    shot: ShotSettings,
+    json: Path | None,
+    shown: Path | None = None,
+    on_written: Callable[[str, Tensor, Metadata], None] | None = None,
+) -> Path:
     """Denoise a shot to a folder, and print the report; returns the last file, which is called ``shown`` there."""
     preview = shot.preview_in(out, video=len(opened) > 1) if shot.preview else None
     if shot.is_budgeted:
@@ -118,7 +129,7 @@ def _denoise(opened: Sequence, out: Path, shot: ShotSettings, json: Path | None,
             output_layer=shot.output_layer,
             picked=choice,
             on_frame=lambda: progress.advance(task),
-            on_written=preview.add if preview else None,
+            on_written=preview.add if preview else on_written,
         )
         taken = time.perf_counter() - began
         if preview:

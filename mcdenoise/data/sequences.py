@@ -68,10 +68,14 @@ def open_sequence(
             raise InputError(f"{where}: expected neither --map nor --layers, found one: these arrays have their names")
         sequence, layout = open_noisebase(zips, chosen, where=where), "noisebase"
     else:
-        groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
         if by_buffer:
             own = ((name, _groups([each], where)[0]) for name, each in zip(by_buffer, given, strict=True))
-            groups = with_stills([replace(group, label=name) for name, found in own for group in found])
+            groups, layout = (
+                with_stills([replace(group, label=name) for name, found in own for group in found]),
+                "files",
+            )
+        else:
+            groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
         named = parse_mapping(mapping)
         sequence = open_files(groups, chosen, where, named, color_has_albedo, lights, color_space)
     place = given[0].resolve()
