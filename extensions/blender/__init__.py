@@ -21,6 +21,13 @@ class DenoiseSettings(bpy.types.PropertyGroup):
     )
 
 
+def _keep_passes(settings):
+    """Make files hold all passes; Blender 5 asks for the kind of the file first."""
+    if hasattr(settings, "media_type"):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format = "OPEN_EXR_MULTILAYER"
+
+
 class RENDER_OT_denoise_passes(bpy.types.Operator):
     """Switch on the passes that are better to denoise with, and the file format that keeps them."""
 
@@ -40,9 +47,7 @@ class RENDER_OT_denoise_passes(bpy.types.Operator):
                     setattr(owner, name, True)
                     changed.append(f"{label} of {layer.name}")
         if scene.render.image_settings.file_format != "OPEN_EXR_MULTILAYER":
-            if hasattr(scene.render.image_settings, "media_type"):
-                scene.render.image_settings.media_type = "MULTI_LAYER_IMAGE"
-            scene.render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+            _keep_passes(scene.render.image_settings)
             changed.append("OpenEXR MultiLayer")
         if scene.cycles.use_denoising:
             scene.cycles.use_denoising = False
@@ -61,7 +66,6 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         """Start from the menu; the window stays usable, and Escape stops after the current frame."""
         if not self.prepare(context):
             return {"CANCELLED"}
-        self.done, self.failed, self.stopped = queue.SimpleQueue(), [], threading.Event()
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
         manager = context.window_manager
@@ -90,7 +94,6 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
         """Run from a script; return when all frames are done."""
         if not self.prepare(context):
             return {"CANCELLED"}
-        self.done, self.failed, self.stopped = queue.SimpleQueue(), [], threading.Event()
         self.run()
         return self.finish(self.done.qsize())
 
@@ -113,12 +116,12 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
             return False
         self.files = [(path, self.output / path.name) for path in rendered]
         self.layer, self.blurred = context.view_layer.name, scene.render.use_motion_blur
+        self.done, self.failed, self.stopped = queue.SimpleQueue(), [], threading.Event()
         return True
 
     def run(self):
         """Denoise the files; it touches no data of Blender, so that it may run in a thread."""
         try:
-            self.output.mkdir(parents=True, exist_ok=True)
             denoise = frames.Denoiser()
             for source, target in self.files:
                 if self.stopped.is_set():
@@ -153,16 +156,19 @@ class IMAGE_OT_denoise_render(bpy.types.Operator):
         """Save the result with its passes, denoise the file, and load it."""
         with tempfile.TemporaryDirectory() as folder:
             source, target = Path(folder) / "render.exr", Path(folder) / "denoised.exr"
-            kept = context.scene.render.image_settings.file_format
+            settings = context.scene.render.image_settings
+            names = [name for name in ("media_type", "file_format") if hasattr(settings, name)]
+            kept = [(name, getattr(settings, name)) for name in names]
             try:
-                context.scene.render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+                _keep_passes(settings)
                 bpy.data.images["Render Result"].save_render(str(source), scene=context.scene)
                 frames.denoise_frame(frames.Denoiser(), source, target, context.view_layer.name)
             except (frames.FrameError, RuntimeError) as error:
                 self.report({"ERROR"}, str(error))
                 return {"CANCELLED"}
             finally:
-                context.scene.render.image_settings.file_format = kept
+                for name, value in kept:
+                    setattr(settings, name, value)
             image = bpy.data.images.load(str(target))
             image.name = "Denoised"
             image.pack()

@@ -29,35 +29,28 @@ class FrameError(Exception):
 
 
 class Denoiser:
-    """Denoises the frames of a shot one after the other, and keeps the graph's state between them.
+    """Denoises the frames of a shot one after the other, and keeps the graph's state between them."""
 
-    Args:
-        threads: CPU threads; 0 for onnxruntime's choice.
-    """
-
-    def __init__(self, threads=0):
+    def __init__(self):
         import onnxruntime  # imported here because it takes as long as a frame
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.log_severity_level = threads, 3
+        options.log_severity_level = 3
         self._session = onnxruntime.InferenceSession(str(MODEL), options, providers=["CPUExecutionProvider"])
         self._outputs = [each.name for each in self._session.get_outputs()]
         self._state = {}
 
     def __call__(self, buffers):
         """The denoised radiance ``(H, W, 3)`` of buffers ``(H, W, C)`` by name, float32."""
-        feeds = {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in buffers.items()}
-        sizes = {}
+        height, width, _ = buffers["color"].shape
+        sizes = {"batch": 1, "height": height, "width": width}
+        feeds = {}
         for given in self._session.get_inputs():
-            # All sizes of a state are sizes of the image, or numbers.
-            shape = feeds[given.name].shape if given.name in feeds else [sizes.get(each, each) for each in given.shape]
-            sizes |= dict(zip(given.shape, shape, strict=True))
-            state = self._state.get(given.name)
-            if given.name not in feeds:
-                feeds[given.name] = (
-                    state if state is not None and state.shape == tuple(shape) else np.zeros(shape, "f4")
-                )
-        feeds = {each.name: feeds[each.name] for each in self._session.get_inputs()}
+            if given.name in buffers:
+                feeds[given.name] = np.ascontiguousarray(buffers[given.name].transpose(2, 0, 1)[None])
+                continue
+            shape, state = tuple(sizes.get(each, each) for each in given.shape), self._state.get(given.name)
+            feeds[given.name] = np.zeros(shape, np.float32) if state is None or state.shape != shape else state
         image, *after = self._session.run(self._outputs, feeds)
         self._state = {name.removeprefix("next_"): each for name, each in zip(self._outputs[1:], after, strict=True)}
         return image[0].transpose(1, 2, 0)
@@ -69,7 +62,7 @@ def denoise_frame(denoise, source, target, layer, *, blurred=False):
     Args:
         denoise: a :class:`Denoiser`.
         source: the rendered file.
-        target: the file to write; its folder exists.
+        target: the file to write; its folder is made.
         layer: name of the view layer.
         blurred: whether there is motion blur, with which Blender's Vector has zeros: then a frame is denoised alone.
 
@@ -83,7 +76,7 @@ def denoise_frame(denoise, source, target, layer, *, blurred=False):
     image = denoise(buffers)
     if not np.isfinite(image).all():
         raise FrameError(f"{source}: the result is not finite")
-    pixels, places = _channels(source, parts, layer, RESULT, "RGB")
+    pixels, places = _channels(source, parts, layer, (RESULT,), "RGB")
     pixels[..., places] = image
     _write(target, parts)
 
@@ -103,27 +96,21 @@ def _read(path):
     return parts
 
 
-def _channels(path, parts, layer, name, letters):
-    """The pixels of the part with a pass of a view layer, and the places of its channels."""
-    for spec, pixels in parts:
+def _channels(path, parts, layer, names, letters):
+    """The pixels of the part with the first pass of a view layer that there is, and the places of its channels."""
+    for name in names:
         wanted = [f"{layer}.{name}.{letter}" for letter in letters]
-        if set(wanted) <= set(spec.channelnames):
-            return pixels, [spec.channelnames.index(each) for each in wanted]
-    raise FrameError(f"{path}: expected the pass {name} of the view layer {layer}, found none; render with it")
+        for spec, pixels in parts:
+            if set(wanted) <= set(spec.channelnames):
+                return pixels, [spec.channelnames.index(each) for each in wanted]
+    raise FrameError(f"{path}: expected the pass {names[-1]} of the view layer {layer}, found none; render with it")
 
 
 def _buffers(path, parts, layer):
     found = {}
     for buffer, (names, letters) in PASSES.items():
-        for name in names:
-            try:
-                pixels, places = _channels(path, parts, layer, name, letters)
-            except FrameError:
-                if name == names[-1]:
-                    raise
-            else:
-                found[buffer] = pixels[..., places]
-                break
+        pixels, places = _channels(path, parts, layer, names, letters)
+        found[buffer] = pixels[..., places]
     depth = found["depth"]
     found["depth"] = np.where(np.isfinite(depth) & (depth < _FARTHEST), depth, np.inf).astype(np.float32)
     found["color"] = np.nan_to_num(found["color"], nan=0, posinf=_BRIGHTEST, neginf=0).clip(0, _BRIGHTEST)
@@ -141,17 +128,18 @@ def _write(path, parts):
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp.exr")
     file = oiio.ImageOutput.create(str(temporary))
-    specs = tuple(spec for spec, _ in parts)
     try:
-        if not file.open(str(temporary), specs if len(specs) > 1 else specs[0]):
-            raise FrameError(f"{path}: cannot be written: {file.geterror()}")
-        for number, (spec, pixels) in enumerate(parts):
-            if number and not file.open(str(temporary), spec, "AppendSubimage"):
-                raise FrameError(f"{path}: cannot be written: {file.geterror()}")
-            if not file.write_image(pixels):
-                raise FrameError(f"{path}: cannot be written: {file.geterror()}")
-        if not file.close():
+        if not _written(file, str(temporary), parts):
             raise FrameError(f"{path}: cannot be written: {file.geterror()}")
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _written(file, name, parts):
+    """Write all parts, as far as that is possible; returns whether it is."""
+    specs = tuple(spec for spec, _ in parts)
+    opened = file.open(name, specs if len(specs) > 1 else specs[0])
+    for number, (spec, pixels) in enumerate(parts):
+        opened = opened and (not number or file.open(name, spec, "AppendSubimage")) and file.write_image(pixels)
+    return opened and file.close()
