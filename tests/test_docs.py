@@ -18,7 +18,12 @@ TEXTS = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CO
 # Run by tests of their own, with the files that they need.
 ELSEWHERE = {"from-your-renderer.md", "from-oidn.md", "performance.md"}
 # Pages with blocks that are files, which later blocks import: their first line is a comment with the file's name.
-FILES = {"bring-your-own-model.md": ["mine"], "bring-your-own-op.md": ["my_ops", "fog", "smooth"]}
+FILES = {
+    "bring-your-own-model.md": ["mine"],
+    "bring-your-own-op.md": ["my_ops", "fog", "smooth"],
+    # Run by tests/test_export.py, with a graph.
+    "for-engines.md": ["run_graph"],
+}
 # Names that stand for what a reader puts there.
 STANDS_FOR = {"SCENE.xml": "scene.xml", "...": "", "N": "1"}
 

@@ -1,12 +1,18 @@
 """A model as one graph: compiled, exported for images of any size, and run by onnxruntime."""
 
+import os
+import shutil
+import subprocess
+import warnings
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from commands import refuses, succeeds
+from test_docs import blocks
 from torch import Tensor, nn
 
 from mcdenoise import Frame, InputError, create_model
@@ -151,6 +157,74 @@ def test_models_of_the_zoo_are_exported(name: str, tmp_path: Path) -> None:
     session = onnxruntime.InferenceSession(str(exported.path), providers=["CPUExecutionProvider"])
     named = {size for each in session.get_inputs() for size in each.shape if isinstance(size, str)}
     assert named == {"batch", "height", "width"}
+    import onnx
+    from onnxruntime.transformers.float16 import convert_float_to_float16
+
+    half = convert_float_to_float16(onnx.load(exported.path), keep_io_types=True)
+    onnx.save(half, exported.path)
+    for image, expected in zip(with_onnxruntime(exported, step, shot), eager(model, shot), strict=True):
+        # Measured on the smallest: 0.0004.
+        assert (image - expected).abs().mean() < 0.005 * expected.mean()
+
+
+class Mean(nn.Module):
+    """The mean with the image before; zeros are no history."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        state = state or {"color": torch.zeros_like(frame.color), "length": torch.zeros_like(frame.color[:, :1])}
+        length = state["length"] + 1
+        mean = (state["color"] * state["length"] + frame.color) / length
+        return Output(mean), {"color": mean, "length": length}
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the graph model.onnx, and in which Python is."""
+    for package in ("onnxscript", "onnxruntime"):
+        pytest.importorskip(package, reason="graphs in ONNX need the extra mcdenoise[export]")
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        export_model(Mean(), Path("model.onnx"))
+    return tmp_path
+
+
+def test_a_graph_is_run_as_the_page_for_engines_does(graph: Path) -> None:
+    import onnx
+
+    (block,) = (each for each in blocks("for-engines.md", "python") if "onnxruntime" in each)
+    found: dict[str, Any] = {}
+    exec(compile(block, "for-engines.md", "exec"), found)
+    shot = [{"color": torch.from_numpy(np.random.default_rng(i).random((1, 3, 90, 160), np.float32))} for i in range(2)]
+    assert_alike([torch.from_numpy(found["image"])], eager(Mean(), shot)[1:])
+    model = onnx.load(graph / "model.onnx")
+    assert [each.version for each in model.opset_import] == [20]
+    assert {each.type.tensor_type.elem_type for each in (*model.graph.input, *model.graph.output)} == {
+        onnx.TensorProto.FLOAT
+    }
+
+
+@pytest.mark.slow
+def test_a_graph_is_run_in_cpp(graph: Path) -> None:
+    """Where the headers of onnxruntime are, named by ONNXRUNTIME_INCLUDE; its library is that of Python."""
+    import onnxruntime
+
+    headers = Path(os.environ.get("ONNXRUNTIME_INCLUDE", "/usr/include/onnxruntime"))
+    libraries = [*Path(onnxruntime.__file__).parent.glob("capi/libonnxruntime.so.*")]
+    if not (headers / "onnxruntime_cxx_api.h").is_file() or not libraries or shutil.which("g++") is None:
+        pytest.skip("no g++, or no headers of onnxruntime: name their folder, ONNXRUNTIME_INCLUDE=FOLDER")
+    library = graph / "libonnxruntime.so.1"
+    library.symlink_to(libraries[0])
+    source = Path(__file__).parents[1] / "examples" / "engine" / "denoise.cpp"
+    options = ("-std=c++17", "-isystem", headers, f"-Wl,-rpath,{graph}", "-Wall", "-Werror")
+    subprocess.run(["g++", *options, source, library, "-o", "denoise"], check=True)
+    shot = [{"color": each["color"]} for each in frames((11, 17))]
+    given = b"".join(each["color"].numpy().tobytes() for each in shot)
+    done = subprocess.run(["./denoise", "model.onnx", "17", "11"], input=given, capture_output=True, check=True)
+    images = np.frombuffer(done.stdout, np.float32).reshape(3, 1, 3, 11, 17)
+    assert_alike([torch.from_numpy(image.copy()) for image in images], eager(Mean(), shot))
 
 
 def test_a_state_of_several_resolutions_and_images_of_any_size(tmp_path: Path) -> None:
