@@ -22,7 +22,6 @@ def evaluate(
     model: str | None = None,
     protocol: ProtocolName = "strict",
     frames: str | None = None,
-    device: str = "cpu",
     json: Json = None,
 ) -> None:
     """Compare denoised images, or those of a model, with references: two files, two folders, or those of a sequence.
@@ -32,10 +31,9 @@ def evaluate(
         images: the denoised image, or a folder with one EXR per frame, such as denoised12.exr or frame.0012.exr,
             scene-linear RGB, written by any denoiser.
         model: evaluate this model instead: a name with optional settings, a weights file, or file.py:factory, as for
-            `mcdenoise denoise`.
+            `mcdenoise denoise`; "NAME(device=cuda)" runs on a GPU.
         protocol: protocol of a publication, whose numbers are printed in addition to the strict ones.
         frames: frames to compare, such as 0-59,70; by default all frames that have a reference.
-        device: device of the model: cpu or cuda.
         json: write the printed figures to this file too.
     """
     if images is not None and model is not None:
@@ -60,7 +58,7 @@ def evaluate(
         if images is not None:
             result = evaluate_folder(opened, images, protocol=protocol, on_frame=advance)
         elif spelling is not None:
-            denoiser = spelling.denoiser(device=device)
+            denoiser = spelling.denoiser()
             warn(filter(None, [spelling.doubt]))
             result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
