@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -11,57 +13,95 @@ from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_method
+from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_halves, evaluate_method
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics.protocols import ProtocolName
+
+Images = tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="[IMAGES ...]", help_behavior_hint="")]]
 
 
 def evaluate(
     sequence: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="SEQUENCE")]],
-    images: tyro.conf.Positional[Path | None] = None,
+    images: Images = (),
     model: str | None = None,
+    half: Path | None = None,
     protocol: ProtocolName = "strict",
     frames: str | None = None,
     json: Json = None,
 ) -> None:
     """Compare denoised images, or those of a model, with references: two files, two folders, or those of a sequence.
 
+    Without references, --half tells which of several denoisers is best, from two renderings with different seeds.
+
     Args:
         sequence: the reference: an image, or a folder or pattern of images; or a folder of a sequence with references.
+            With --half, the noisy frames that were denoised.
         images: the denoised image, or a folder with one EXR per frame, such as denoised12.exr or frame.0012.exr,
-            scene-linear RGB, written by any denoiser.
+            scene-linear RGB, written by any denoiser. With --half, one for each denoiser.
         model: evaluate this model instead: a name with optional settings, a weights file, or file.py:factory, as for
             `mcdenoise denoise`; "NAME(device=cuda)" runs on a GPU.
+        half: the same noisy frames, rendered with another seed, which no denoiser has seen.
         protocol: protocol of a publication, whose numbers are printed in addition to the strict ones.
         frames: frames to compare, such as 0-59,70; by default all frames that have a reference.
         json: write the printed figures to this file too.
     """
-    if images is not None and model is not None:
-        raise InputError(f"expected a folder of images or --model, found both, {images} and {model}; omit one of them")
-    if images is None and model is None:
+    named = ", ".join(map(str, images))
+    if images and model is not None:
+        raise InputError(f"expected a folder of images or --model, found both, {named} and {model}; omit one of them")
+    if half is not None:
+        if not images or protocol != "strict":
+            found = f"--protocol {protocol}" if images else "none"
+            raise InputError(f"--half: expected folders of denoised images, and the strict protocol, found {found}")
+        _evaluate_halves(sequence, half, images, frames, json)
+        return
+    if not images and model is None:
         raise InputError(
             f"expected a folder of images or --model, found only the sequence {sequence}; name the folder after it, or "
             "add --model NAME to denoise and compare"
         )
+    if len(images) > 1:
+        raise InputError(f"expected one folder of images, found {named}; several are compared by --half")
     opened = open_sequence(sequence, frames)
-    if images is not None and not opened.reference_numbers:
+    if images and not opened.reference_numbers:
         opened = open_sequence({"color": sequence, "reference": sequence}, frames)
         say(f"{sequence} has no references, and is taken as the reference")
     spelling = None if model is None else parse_method(model)
     total = len(opened.reference_numbers if spelling is None else opened.numbers)
-    with progress_bar() as progress:
-        task = progress.add_task("evaluate", total=total)
-
-        def advance(_: int) -> None:
-            progress.advance(task)
-
-        if images is not None:
-            result = evaluate_folder(opened, images, protocol=protocol, on_frame=advance)
-        elif spelling is not None:
+    with _progress(total) as advance:
+        if spelling is None:
+            result = evaluate_folder(opened, images[0], protocol=protocol, on_frame=advance)
+        else:
             denoiser = spelling.denoiser()
             warn(filter(None, [spelling.doubt]))
             result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
+    write_json(json, result.as_json())
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[int], None]]:
+    with progress_bar() as progress:
+        task = progress.add_task("evaluate", total=total)
+        yield lambda _: progress.advance(task)
+
+
+def _evaluate_halves(
+    sequence: Path, half: Path, images: tuple[Path, ...], frames: str | None, json: Path | None
+) -> None:
+    first, other = (open_sequence(each, frames) for each in (sequence, half))
+    with _progress(len(first)) as advance:
+        result = evaluate_halves(first, other, {str(each): each for each in images}, advance)
+    warn(result.doubts)
+    best, *others = result.ranking
+    errors = {name: result.error(name) for name in (best, *others)}
+    print_rows([{"image": name, "error": f"{of:.3g}", "±": f"{margin:.2g}"} for name, (of, margin) in errors.items()])
+    for name in others:
+        excess, margin = result.difference(name, best)
+        if excess > margin:
+            say(f"{best} is better than {name}: its error is lower by {excess:.3g} ± {margin:.2g}")
+        else:
+            say(f"{best} or {name}: {excess:.3g} ± {margin:.2g} apart, too little to tell; compare more frames")
+    say(f"error: squared, relative to the brightness around; {result.frames} frames; within ± in 95 of 100 cases")
     write_json(json, result.as_json())
 
 

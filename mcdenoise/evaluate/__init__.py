@@ -1,6 +1,7 @@
 """Errors against references, of a folder of images or of a method on a sequence."""
 
 from mcdenoise.evaluate.folder import Evaluation, Table, evaluate_folder, evaluate_method, find_images
+from mcdenoise.evaluate.halves import Halves, evaluate_halves
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
 from mcdenoise.evaluate.scores import METRICS, USUAL, check_references, measure
 from mcdenoise.metrics import Metric
@@ -9,10 +10,12 @@ __all__ = [
     "METRICS",
     "USUAL",
     "Evaluation",
+    "Halves",
     "Metric",
     "Table",
     "check_references",
     "evaluate_folder",
+    "evaluate_halves",
     "evaluate_method",
     "find_images",
     "measure",

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
+from mcdenoise.data.exr import Metadata
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -211,7 +212,7 @@ def evaluate_folder(
     check_references(sequence)
     files = find_images(folder, sequence.reference_numbers)
     for path in files.values():
-        _check_header(path, sequence.size)
+        check_header(path, sequence.size)
     images = ((number, *_read(sequence, number, path)) for number, path in files.items())
     return _evaluate(sequence, folder, images, protocol, on_frame)
 
@@ -365,17 +366,26 @@ def _explain(table: Table, temporal: Iterable[str]) -> None:
             table.skipped.setdefault(name, "no two successive frames with references")
 
 
-def _check_header(path: Path, size: tuple[int, int]) -> None:
+def check_header(path: Path, size: tuple[int, int]) -> None:
+    """Check that an image has the size of its sequence.
+
+    Raises:
+        InputError: it has another.
+    """
     height, width = open_result(path).size
     if (height, width) != size:
         raise InputError(
-            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; "
-            "denoise at the size of the references"
+            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; denoise at "
+            "that size"
         )
 
 
-def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
-    """Read image, frame and reference; both images are converted to the primaries of Rec. 709."""
+def read_image(path: Path) -> tuple[Tensor, Metadata]:
+    """Read a denoised image, ``(1, 3, H, W)``, and the attributes of its file.
+
+    Raises:
+        InputError: it is damaged, or has pixels that are not finite.
+    """
     image, metadata = open_result(path).read()
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():
@@ -384,6 +394,12 @@ def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, T
             f"{path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, first at "
             f"row {row}, column {column}; errors are undefined for such pixels: repair them, or skip the frame"
         )
+    return image, metadata
+
+
+def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
+    """Read image, frame and reference; both images are converted to the primaries of Rec. 709."""
+    image, metadata = read_image(path)
     try:
         frame, _ = sequence.frame(number).with_depth().validate()
     except InputError as error:
