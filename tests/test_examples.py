@@ -269,6 +269,20 @@ def test_mitsuba_denoiser_denoises_a_still_and_optimises_where_mitsuba_different
     assert float(found[2]) < float(found[1])
 
 
+@pytest.mark.slow
+def test_mitsuba_denoiser_is_measured_beside_plain_rendering() -> None:
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    small = ("--size", "32", "--samples", "1", "--rounds", "1", "--models", "cascaded_v2_micro")
+    said = run("mitsuba_denoiser.py", "--measure", "32", *small)
+    if "LLVM" in said:
+        pytest.skip(said)
+    steps = dict(re.findall(r"^\| 32 \| (.*?) \|.* ([\d.]+) \|$", said, re.MULTILINE))
+    assert list(steps) == ["rendering alone", "with `cascaded_v2_micro`"]
+    assert float(steps["rendering alone"]) == 1
+    errors = {name: float(error) for name, error in re.findall(r"^\| (\S+) \| .* \| ([\d.]+) \|$", said, re.MULTILINE)}
+    assert errors["`cascaded_v2_micro`"] < errors["noisy"]
+
+
 def test_layers_of_a_blender_shot_are_compared(tmp_path: Path) -> None:
     for path in (RENDERERS / "blender").iterdir():
         for name in (path.name, path.name.replace("shot", "reference")):

@@ -59,7 +59,7 @@ ALLOWED: dict[str, set[str]] = {
     "denoiser": SIGNAL | {"models"},
     "methods": SIGNAL | {"models", "denoiser"},
     # These modules are for scripts of a renderer: nothing of the package imports them.
-    "integrations": SIGNAL | {"models", "denoiser"},
+    "integrations": SIGNAL | {"models", "denoiser", "threads"},
     "sequence_report": {"models"},
     "folder": LIBRARY,
     "shot": LIBRARY | {"budget", "methods", "preview"},

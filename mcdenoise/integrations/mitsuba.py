@@ -34,7 +34,8 @@ class MitsubaDenoiser:
     **Bitmaps** are returned in the pixel format of the noisy layer, as linear float32; a noisy bitmap of another
     component format, or with a display curve, is converted first.
 
-    **Tensors** are returned as tensors of the same shape. In a differentiable variant (``llvm_ad_rgb``,
+    **Tensors** are returned as tensors of the same shape. They share their memory with torch, except that the scalar
+    variants copy the result. In a differentiable variant (``llvm_ad_rgb``,
     ``cuda_ad_rgb``), derivatives in ``noisy``, ``albedo``, ``normals`` and ``flow`` propagate through
     :func:`drjit.wrap`, in reverse and forward mode, if gradients of one of them are enabled; otherwise no graph is
     built. Decisions of the method are held fixed, see ``differentiable`` of :class:`mcdenoise.Denoiser`. The history is
