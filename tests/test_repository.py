@@ -1,11 +1,17 @@
-"""The repository holds no paths of one machine, no pickles, and weights of a modest size."""
+"""The repository holds no paths of one machine, no pickles, and weights of a modest size; its wheel stands alone."""
 
 import ast
 import re
+import shutil
 import subprocess
+import sys
+import zipfile
 from pathlib import Path
 
 import pytest
+
+from mcdenoise.benchmark.sizes import synthetic_frame
+from mcdenoise.data.readers.bmfr import write_bmfr_frame
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINE_PATH = re.compile(r"(^|[^A-Za-z0-9_.])/(home|root|tmp|opt|srv|work)/[a-z]")
@@ -13,6 +19,19 @@ PICKLERS = {"cloudpickle", "dill", "joblib", "pickle", "shelve"}
 PICKLED = {".bin", ".ckpt", ".npy", ".npz", ".pickle", ".pkl", ".pt", ".pth"}
 WEIGHTS_LIMIT = 40e6
 FILE_LIMIT = 2e6
+WHEEL_LIMIT = 25e6
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+# Runs a command of the package in a folder, without what only extras install.
+INSTALLED = """
+import sys
+folder, *sys.argv[1:] = sys.argv[1:]
+extras = "av drjit flip_evaluator lightning_fabric matplotlib mitsuba numba onnx onnxruntime PIL pyoidn ray tensorboard"
+sys.modules |= dict.fromkeys([*extras.split(), "pytorch_msssim", "zarr"])
+sys.path.insert(0, folder)
+import mcdenoise.cli
+assert mcdenoise.__file__.startswith(folder), mcdenoise.__file__
+mcdenoise.cli.main()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +118,22 @@ def test_the_source_archive_holds_every_file(files: list[Path]) -> None:
     included = {name for words in lines if words[:1] == ["include"] for name in words[1:]}
     included |= {"pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", ".gitignore", ".ci"}
     assert {path.relative_to(ROOT).parts[0] for path in files} <= grafted | included
+
+
+@pytest.mark.slow
+def test_the_wheel_alone_denoises_a_still_without_extras(tmp_path: Path) -> None:
+    pytest.importorskip("setuptools", minversion="77")
+    source, site = tmp_path / "source", tmp_path / "site"
+    shutil.copytree(ROOT / "mcdenoise", source / "mcdenoise", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(ROOT / name, source)
+    subprocess.run([sys.executable, "-c", BUILD, tmp_path], cwd=source, check=True, capture_output=True, timeout=250)
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.stat().st_size < WHEEL_LIMIT
+    zipfile.ZipFile(wheel).extractall(site)
+    write_bmfr_frame(tmp_path / "frames", 0, synthetic_frame(64, 36))
+    for command in (["denoise", tmp_path / "frames/color0.exr", "-o", tmp_path / "clean.exr"], ["models"]):
+        child = [sys.executable, "-P", "-c", INSTALLED, site, *command]
+        done = subprocess.run(child, cwd=tmp_path, capture_output=True, text=True, timeout=250, check=False)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "clean.exr").stat().st_size > 1000
