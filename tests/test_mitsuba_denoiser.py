@@ -1,9 +1,12 @@
 """The stand-in for `mi.OptixDenoiser`: bitmaps, tensors, gradients, and the meaning of its arguments here."""
 
 import importlib
+import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +34,15 @@ def mi() -> Iterator[Any]:
     drjit.set_thread_count(max(2, drjit.thread_count()))
     yield mitsuba
     mitsuba.set_variant("scalar_rgb")
+
+
+def test_threads_of_torch_do_not_spin_beside_those_of_the_renderer() -> None:
+    """In a process of its own, since torch is here already."""
+    code = "import os, mcdenoise.integrations.mitsuba; print(os.environ['OMP_WAIT_POLICY'])"
+    environment = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "KMP_BLOCKTIME")}
+    environment.pop("OMP_WAIT_POLICY", None)
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "PASSIVE\n"
 
 
 TRIAL = """
@@ -87,6 +99,17 @@ def smape(image: Array, reference: Array) -> float:
 
 
 # Bitmaps
+
+
+def test_the_example_of_the_page_runs(mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).resolve().parents[1] / "docs" / "mitsuba.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 600
+    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    exec(compile(code, "mitsuba.md", "exec"), {"__name__": "page"})
+    clean = np.array(mi.Bitmap("clean.exr"))
+    assert clean.shape == (HEIGHT, WIDTH, 3)
+    assert np.isfinite(clean).all()
 
 
 def test_a_bitmap_of_layers_is_denoised_as_its_arrays_are(mi: Any, rendered: tuple[Any, Array]) -> None:
@@ -178,6 +201,28 @@ def test_tensors_are_denoised_as_arrays_are(variant: str, request: pytest.Fixtur
     assert np.array_equal(clean.numpy()[..., 3], color[..., 3])
     # Memory of another layout may be summed in another order.
     np.testing.assert_allclose(clean.numpy()[..., :3], expected[0].permute(1, 2, 0).numpy(), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("gradients", [False, True], ids=["image", "gradients"])
+def test_tensors_cross_to_torch_and_back_without_copies(
+    ad: Any, gradients: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drjit = importlib.import_module("drjit")
+    seen: list[list[int]] = []
+
+    def step(self: Any, denoiser: Denoiser, noisy: Tensor, buffers: dict[str, Tensor], **settings: Any) -> Tensor:
+        clean = original(self, denoiser, noisy, buffers, **settings)
+        seen.append([each.data_ptr() for each in (noisy, *buffers.values(), clean)])
+        return clean
+
+    original = MitsubaDenoiser._step
+    monkeypatch.setattr(MitsubaDenoiser, "_step", step)
+    tensors = [ad.TensorXf(noise(3, seed)) for seed in range(3)]
+    drjit.eval(*tensors)
+    if gradients:
+        drjit.enable_grad(*tensors)
+    clean = MitsubaDenoiser((WIDTH, HEIGHT), albedo=True, normals=True, model=MODEL)(*tensors)
+    assert seen == [[drjit.detach(each).numpy().ctypes.data for each in (*tensors, clean)]]
 
 
 def of_torch(color: Array, weights: Tensor, **features: Tensor) -> dict[str, Array]:
