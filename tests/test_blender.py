@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import torch
 from commands import succeeds
 
+from mcdenoise import Frame
 from mcdenoise.data import open_sequence
+from mcdenoise.models import _layers
 
 ROOT = Path(__file__).resolve().parents[1]
 EXTENSION = ROOT / "extensions" / "blender"
@@ -72,6 +75,26 @@ def parts(path: Path) -> dict[str, Any]:
     return found
 
 
+def test_layers_of_light_are_split_as_by_the_package(frames: Any) -> None:
+    lights = {name: torch.rand(1, 3, 6, 8) for name in ("a", "b")}
+    for light in lights.values():
+        light[..., :2] = 0
+    color, image = sum(lights.values()) * torch.linspace(0.995, 1.5, 8), torch.rand(1, 3, 6, 8)
+
+    def numpy(images: dict[str, torch.Tensor]) -> list[Any]:
+        return [each[0].permute(1, 2, 0).numpy() for each in images.values()]
+
+    given = dict(zip(lights, numpy(lights), strict=True))
+    noisy = _layers.closed(
+        Frame(color, layers=lights), lambda excess, handle: handle(excess.reshape(1).tolist())
+    ).layers
+    found = frames.closed(*numpy({"": color}), given)
+    np.testing.assert_allclose([*found.values()], numpy(dict(noisy)), rtol=1e-6)
+    found = frames.in_proportion(*numpy({"": image}), found)
+    np.testing.assert_allclose([*found.values()], numpy(_layers.split(image, noisy)), rtol=1e-6)
+    np.testing.assert_allclose(sum(found.values()), numpy({"": image})[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("name", "layer", "expected"),
     [("shot_0007.exr", "Another", "pass Combined"), ("shot_0009.exr", "Main Layer v1.2", "cannot be read")],
@@ -103,6 +126,7 @@ for step in ("passes", "animation"):
         bpy.context.view_layer.name = layer
         scene.render.filepath = rendered
         scene.frame_start, scene.frame_end = int(first), int(last)
+        scene.denoise_animation.lights = True
     try:
         print(step, getattr(bpy.ops.render, f"denoise_{step}")())
     except RuntimeError as error:
@@ -122,10 +146,12 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
-def test_the_zip_denoises_in_blender_as_the_command_does(archive: Path, tmp_path: Path) -> None:
+def test_the_zip_denoises_in_blender_as_the_command_does(frames: Any, archive: Path, tmp_path: Path) -> None:
     assert archive.stat().st_size < 60e6
     with zipfile.ZipFile(archive) as file:
-        assert {"blender_manifest.toml", "__init__.py", "frames.py", "model.onnx"} < set(file.namelist())
+        assert {"blender_manifest.toml", "__init__.py", "frames.py", "model.onnx", "smoother.onnx"} < set(
+            file.namelist()
+        )
     render = ROOT / "examples" / "blender" / "render.py"
     shot = tmp_path / "my shot"
     subprocess.run([PYTHON, render, "-o", shot, "--size", "96x64", "--frames", "4", "--samples", "2"], check=True)
@@ -138,14 +164,17 @@ def test_the_zip_denoises_in_blender_as_the_command_does(archive: Path, tmp_path
 
     assert run("4") == ["passes {'FINISHED'}", "animation {'FINISHED'}"]
     # The graph compares surfaces by their depth.
-    same = ("--model", "oidn_tuned", "--keep-all", "--map", "position=")
+    same = ("--model", "oidn_tuned", "--keep-all", "--map", "position=", "--layers", "all")
     succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", *same)
     for number in range(1, 5):
         found, expected = (parts(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out"))
-        for letter in "RGB":
-            name = f"ViewLayer.Combined.{letter}"
-            error = np.abs(found[name] - expected[name]) / (np.abs(expected[name]) + expected[name].mean())
+        lit = [name for name in found if any(f".{light}." in name for light in ("Combined", *frames.LIGHTS))]
+        assert len(lit) > 4
+        for name in lit:
+            if name.endswith(".A"):
+                continue
+            error = np.abs(found[name] - expected[name]) / (np.abs(expected[name]) + expected[name].mean() + 1e-6)
             # Both were rounded to half floats.
-            assert error.max() < 2e-3, (number, letter)
-            assert error.mean() < 1e-5, (number, letter)
+            assert error.max() < 2e-3, (number, name)
+            assert error.mean() < 1e-5, (number, name)
     assert "shot_0005.exr is not there" in run("5")[1]

@@ -19,6 +19,10 @@ class DenoiseSettings(bpy.types.PropertyGroup):
     output: bpy.props.StringProperty(
         name="Output", subtype="DIR_PATH", description="Folder to write to; empty: `denoised` beside the rendered files"
     )
+    lights: bpy.props.BoolProperty(
+        name="Layers of Light",
+        description="Denoise the passes of light too, such as Diffuse Direct, so that they add up to the image",
+    )
 
 
 def _keep_passes(settings):
@@ -115,7 +119,8 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
             self.report({"ERROR"}, f"{self.output} has the rendered files; choose another folder")
             return False
         self.files = [(path, self.output / path.name) for path in rendered]
-        self.layer, self.blurred = context.view_layer.name, scene.render.use_motion_blur
+        self.layer = context.view_layer.name
+        self.settings = {"blurred": scene.render.use_motion_blur, "lights": scene.denoise_animation.lights}
         self.done, self.failed, self.stopped = queue.SimpleQueue(), [], threading.Event()
         return True
 
@@ -126,7 +131,7 @@ class RENDER_OT_denoise_animation(bpy.types.Operator):
             for source, target in self.files:
                 if self.stopped.is_set():
                     return
-                frames.denoise_frame(denoise, source, target, self.layer, blurred=self.blurred)
+                frames.denoise_frame(denoise, source, target, self.layer, **self.settings)
                 self.done.put(target)
         except (frames.FrameError, OSError) as error:
             self.failed.append(str(error))
@@ -190,6 +195,7 @@ class RENDER_PT_denoise_animation(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         layout.use_property_split = True
         layout.prop(scene.denoise_animation, "output")
+        layout.prop(scene.denoise_animation, "lights")
         if scene.render.use_motion_blur:
             layout.label(text="With motion blur, Blender writes no Vector: frames are denoised alone", icon="INFO")
         layout.operator(RENDER_OT_denoise_passes.bl_idname)

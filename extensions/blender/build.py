@@ -13,16 +13,35 @@ import tempfile
 import zipfile
 from pathlib import Path
 
+from torch import nn
+
 from mcdenoise.data.files import atomic_path
 from mcdenoise.denoiser import FILTERED
 from mcdenoise.export import export_model
-from mcdenoise.models import create_model
+from mcdenoise.frame import Frame
+from mcdenoise.models import Needs, Output, State, create_model
+from mcdenoise.models._layers import fractions
 
 HERE = Path(__file__).parent
 # The model that the command picks for the frames of a renderer.
 MODEL, BUFFERS = FILTERED, ("color", "albedo", "normal", "depth", "motion")
 WHEEL, PYTHON = "onnxruntime==1.22.0", "3.11"
 PLATFORMS = {("Linux", "x86_64"): "linux-x64", ("Windows", "AMD64"): "windows-x64", ("Darwin", "arm64"): "macos-arm64"}
+
+
+class Smoother(nn.Module):
+    """Smooths a layer of light as :class:`mcdenoise.Denoiser` does; a frame brings it as its diffuse light.
+
+    ``frame.current`` is the denoised image.
+    """
+
+    needs = Needs(frozenset({"diffuse", "current"}), frozenset({"albedo", "normal", "depth"}), trainable=False)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        assert frame.diffuse is not None
+        assert frame.current is not None
+        return Output(fractions(frame.replace(layers={"light": frame.diffuse}), frame.current)["light"]), None
 
 
 def main() -> None:
@@ -42,13 +61,15 @@ def main() -> None:
         export_model(
             create_model(asked.model, pretrained=True), folder / "model.onnx", buffers=BUFFERS, name=asked.model
         )
+        lit = ("color", "albedo", "normal", "depth", "diffuse", "current")
+        export_model(Smoother(), folder / "smoother.onnx", buffers=lit)
         (wheel,) = folder.glob("*.whl")
         manifest = (HERE / "blender_manifest.toml").read_text()
         added = f'platforms = ["{PLATFORMS[here]}"]\nwheels = ["./wheels/{wheel.name}"]\n\n[permissions]'
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as file:
             file.writestr("blender_manifest.toml", manifest.replace("[permissions]", added))
             file.write(wheel, f"wheels/{wheel.name}")
-            for path in (folder / "model.onnx", HERE / "__init__.py", HERE / "frames.py"):
+            for path in (*folder.glob("*.onnx"), HERE / "__init__.py", HERE / "frames.py"):
                 file.write(path, path.name)
     print(f"{asked.out}: {asked.out.stat().st_size / 1e6:.0f} MB, for Blender on {PLATFORMS[here]}")
 

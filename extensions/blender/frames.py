@@ -10,7 +10,7 @@ try:
 except ImportError:
     import OpenImageIO as oiio
 
-MODEL = Path(__file__).with_name("model.onnx")
+MODEL, SMOOTHER = (Path(__file__).with_name(name) for name in ("model.onnx", "smoother.onnx"))
 # The passes of each buffer, the preferred one first, and their channels.
 PASSES = {
     "color": (("Noisy Image", "Combined"), "RGB"),
@@ -20,6 +20,21 @@ PASSES = {
     "motion": (("Vector",), "XY"),
 }
 RESULT = "Combined"
+# The passes of light, and the color by which Blender has divided each; to Blender 4, and from Blender 5 on.
+LIGHTS = {
+    **{f"{kind}{way}": f"{kind}Col" for kind in ("Diff", "Gloss", "Trans") for way in ("Dir", "Ind")},
+    **{
+        f"{kind} {way}": f"{kind} Color"
+        for kind in ("Diffuse", "Glossy", "Transmission")
+        for way in ("Direct", "Indirect")
+    },
+    **dict.fromkeys(("VolumeDir", "VolumeInd", "Emit", "Env")),
+    **dict.fromkeys(("Volume Direct", "Volume Indirect", "Emission", "Environment")),
+}
+REST = ""  # the light of Combined that is in none of the passes
+_DARKEST = 1e-3  # smallest color that light is divided by
+# Relative rounding error of a sum of half floats, and the smallest of them.
+_ROUNDING, _SMALLEST = 2.0**-9, 2.0**-24
 # Blender writes 1e10 where no surface is.
 _FARTHEST, _BRIGHTEST = 1e9, 1e16
 
@@ -32,11 +47,7 @@ class Denoiser:
     """Denoises the frames of a shot one after the other, and keeps the graph's state between them."""
 
     def __init__(self):
-        import onnxruntime  # imported here because it takes as long as a frame
-
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 3
-        self._session = onnxruntime.InferenceSession(str(MODEL), options, providers=["CPUExecutionProvider"])
+        self._session, self._smoother = _session(MODEL), None
         self._outputs = [each.name for each in self._session.get_outputs()]
         self._state = {}
 
@@ -47,7 +58,7 @@ class Denoiser:
         feeds = {}
         for given in self._session.get_inputs():
             if given.name in buffers:
-                feeds[given.name] = np.ascontiguousarray(buffers[given.name].transpose(2, 0, 1)[None])
+                feeds[given.name] = _batch(buffers[given.name])
                 continue
             shape, state = tuple(sizes.get(each, each) for each in given.shape), self._state.get(given.name)
             feeds[given.name] = np.zeros(shape, np.float32) if state is None or state.shape != shape else state
@@ -55,8 +66,38 @@ class Denoiser:
         self._state = {name.removeprefix("next_"): each for name, each in zip(self._outputs[1:], after, strict=True)}
         return image[0].transpose(1, 2, 0)
 
+    def split(self, buffers, image, lights):
+        """Split the denoised image ``(H, W, 3)`` into parts for the noisy lights ``(H, W, 3)`` by name."""
+        self._smoother = self._smoother or _session(SMOOTHER)
+        given = {name: _batch(pixels) for name, pixels in {**buffers, "current": image}.items() if name != "motion"}
+        smooth = {
+            name: self._smoother.run(None, {**given, "diffuse": _batch(light)})[0] for name, light in lights.items()
+        }
+        return in_proportion(image, {name: light[0].transpose(1, 2, 0) for name, light in smooth.items()})
 
-def denoise_frame(denoise, source, target, layer, *, blurred=False):
+
+def in_proportion(image, lights):
+    """Parts of an image ``(H, W, 3)`` in the proportion of lights, or of their means where all lights are black."""
+    lights = {name: light.clip(0) for name, light in lights.items()}
+    total, means = sum(lights.values()), {name: light.mean((0, 1)) for name, light in lights.items()}
+    whole = sum(means.values())
+    parts = {}
+    for name, light in lights.items():
+        mean = np.divide(means[name], whole, out=np.full_like(whole, 1 / len(lights)), where=whole > 0)
+        parts[name] = image * np.divide(light, total, out=np.broadcast_to(mean, light.shape).copy(), where=total > 0)
+    return parts
+
+
+def closed(color, lights):
+    """Lights ``(H, W, 3)`` by name that add up to the color, with what is left as :data:`REST`."""
+    total = sum(lights.values())
+    rest, least = color - total, _ROUNDING * color + (len(lights) + 1) * _SMALLEST
+    none_left = (rest <= least).all()
+    scale = np.divide(color, total, out=np.ones_like(color), where=(total > 0) & ((rest < 0) | none_left))
+    return {name: light * scale for name, light in lights.items()} | {REST: np.where(none_left, 0, rest.clip(0))}
+
+
+def denoise_frame(denoise, source, target, layer, *, blurred=False, lights=False):
     """Write a copy of a multilayer EXR whose Combined is denoised; everything else is unchanged.
 
     Args:
@@ -65,6 +106,7 @@ def denoise_frame(denoise, source, target, layer, *, blurred=False):
         target: the file to write; its folder is made.
         layer: name of the view layer.
         blurred: whether there is motion blur, with which Blender's Vector has zeros: then a frame is denoised alone.
+        lights: whether the passes of light are denoised too, so that they add up to the image.
 
     Raises:
         FrameError: the file cannot be read, lacks a pass of :data:`PASSES`, or the other cannot be written.
@@ -76,9 +118,48 @@ def denoise_frame(denoise, source, target, layer, *, blurred=False):
     image = denoise(buffers)
     if not np.isfinite(image).all():
         raise FrameError(f"{source}: the result is not finite")
+    if lights:
+        _denoise_lights(denoise, source, parts, layer, buffers, image)
     pixels, places = _channels(source, parts, layer, (RESULT,), "RGB")
     pixels[..., places] = image
     _write(target, parts)
+
+
+def _denoise_lights(denoise, path, parts, layer, buffers, image):
+    """Replace the pixels of the passes of light."""
+    there = {name for spec, _ in parts for name in spec.channelnames}
+    found = {name: color for name, color in LIGHTS.items() if f"{layer}.{name}.R" in there}
+    if not found:
+        raise FrameError(f"{path}: expected passes of light, such as Diffuse Direct, found none; render with them")
+    places = {name: _channels(path, parts, layer, (name,), "RGB") for name in found}
+    colors = {}
+    for name, color in found.items():
+        # Light that is not divided has a color of one.
+        one = np.ones((1, 1, 3), np.float32), slice(None)
+        pixels, at = one if color is None else _channels(path, parts, layer, (color,), "RGB")
+        colors[name] = pixels[..., at]
+    noisy = {name: np.nan_to_num(pixels[..., at]) * colors[name] for name, (pixels, at) in places.items()}
+    split = denoise.split(buffers, image, closed(buffers["color"], noisy))
+    del split[REST]
+    # A pass cannot hold light where its color is black: the others get it, so that the sum stays.
+    held = {name: np.where(colors[name] > _DARKEST, light, 0) for name, light in split.items()}
+    total, left = sum(split.values()), sum(held.values())
+    scale = np.divide(total, left, out=np.ones_like(total), where=left > 0)
+    for name, (pixels, at) in places.items():
+        pixels[..., at] = held[name] * scale / np.maximum(colors[name], _DARKEST)
+
+
+def _session(path):
+    import onnxruntime  # imported here because it takes as long as a frame
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def _batch(image):
+    """An image ``(H, W, C)`` as ``(1, C, H, W)``."""
+    return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
 
 
 def _read(path):

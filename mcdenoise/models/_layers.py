@@ -142,8 +142,8 @@ def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
 
 
 def _smoothed(image: Tensor, guide: Tensor) -> Tensor:
-    logits = guide.new_zeros(()).expand(len(guide), 25, *guide.shape[2:])
-    scale = guide.new_ones(()).expand(len(guide), 1, *guide.shape[2:])
+    logits = guide.new_zeros(()).expand(guide.shape[0], 25, *guide.shape[2:])
+    scale = guide.new_ones(()).expand(guide.shape[0], 1, *guide.shape[2:])
     return cross_bilateral_filter(image, logits, [guide], [scale], border="renormalize")
 
 

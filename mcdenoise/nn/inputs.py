@@ -79,7 +79,7 @@ def image_statistics(frame: Frame) -> dict[str, Tensor]:
         found["exposure"] = auto_exposure(frame.color)
     found |= scale_of_depth(frame)
     if "depth_scale" not in found:
-        found["depth_scale"] = torch.cat(depth_scale(frame.color.new_ones(len(frame.color), 1, 1, 1)), 1)
+        found["depth_scale"] = torch.cat(depth_scale(frame.color.new_ones(frame.color.shape[0], 1, 1, 1)), 1)
     return found
 
 
