@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 TEXTS = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "training/README.md"))]
 # Run by tests of their own, with the files that they need.
-ELSEWHERE = {"from-your-renderer.md", "from-oidn.md", "mitsuba.md", "performance.md"}
+ELSEWHERE = {"blender.md", "from-your-renderer.md", "from-oidn.md", "mitsuba.md", "performance.md"}
 # Pages with blocks that are files, which later blocks import: their first line is a comment with the file's name.
 FILES = {
     "bring-your-own-model.md": ["mine"],

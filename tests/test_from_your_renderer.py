@@ -1,4 +1,4 @@
-"""docs/from-your-renderer.md: its code runs, its commands do what they say, and every row of its tables is true."""
+"""docs/from-your-renderer.md and blender.md: code and commands do what they say, and rows of tables are true."""
 
 import importlib.util
 import re
@@ -20,6 +20,7 @@ sys.path.insert(0, str(RENDERERS))
 import others  # noqa: E402
 
 SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE.read_text(), re.MULTILINE | re.DOTALL))
+SECTIONS["Blender"] = PAGE.with_name("blender.md").read_text()
 # The files of each row, and what stands for its columns where a name is of another buffer.
 RENDERED = {
     "Blender 4.5": "blender",
