@@ -35,12 +35,11 @@ class MitsubaDenoiser:
     component format, or with a display curve, is converted first.
 
     **Tensors** are returned as tensors of the same shape. They share their memory with torch, except that the scalar
-    variants copy the result. In a differentiable variant (``llvm_ad_rgb``,
-    ``cuda_ad_rgb``), derivatives in ``noisy``, ``albedo``, ``normals`` and ``flow`` propagate through
-    :func:`drjit.wrap`, in reverse and forward mode, if gradients of one of them are enabled; otherwise no graph is
-    built. Decisions of the method are held fixed, see ``differentiable`` of :class:`mcdenoise.Denoiser`. The history is
-    a constant: gradients do not reach earlier frames. Parameters of a model given by name get no gradients; those of a
-    module that you pass do.
+    variants copy the result. In a differentiable variant (``llvm_ad_rgb``, ``cuda_ad_rgb``), derivatives in ``noisy``,
+    ``albedo``, ``normals`` and ``flow`` propagate through :func:`drjit.wrap`, in reverse and forward mode, if gradients
+    of one of them are enabled; otherwise no graph is built. Decisions of the method are held fixed, see
+    ``differentiable`` of :class:`mcdenoise.Denoiser`. The history is a constant: gradients do not reach earlier frames.
+    Parameters of a model given by name get no gradients; those of a module that you pass do.
 
     **Temporal denoising**: this denoiser stores its own history (the accumulated radiance, its length, and the visible
     surfaces) and does not use the image in ``previous_denoised``. That argument only marks the beginning of a shot:
