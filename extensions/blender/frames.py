@@ -132,12 +132,11 @@ def _denoise_lights(denoise, path, parts, layer, buffers, image):
     if not found:
         raise FrameError(f"{path}: expected passes of light, such as Diffuse Direct, found none; render with them")
     places = {name: _channels(path, parts, layer, (name,), "RGB") for name in found}
-    colors = {}
+    colors = dict.fromkeys(found, np.ones((1, 1, 3), np.float32))  # of light that is not divided
     for name, color in found.items():
-        # Light that is not divided has a color of one.
-        one = np.ones((1, 1, 3), np.float32), slice(None)
-        pixels, at = one if color is None else _channels(path, parts, layer, (color,), "RGB")
-        colors[name] = pixels[..., at]
+        if color is not None:
+            pixels, at = _channels(path, parts, layer, (color,), "RGB")
+            colors[name] = pixels[..., at]
     noisy = {name: np.nan_to_num(pixels[..., at]) * colors[name] for name, (pixels, at) in places.items()}
     split = denoise.split(buffers, image, closed(buffers["color"], noisy))
     del split[REST]
