@@ -19,7 +19,6 @@ import argparse
 import functools
 import importlib
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,6 +28,7 @@ import numpy as np
 
 from mcdenoise.integrations.mitsuba import MitsubaDenoiser
 from mcdenoise.scenes.render.loading import LLVM, first_working
+from mcdenoise.turns import interleaved
 
 WALLS = "white.reflectance.value"
 START = (0.3, 0.3, 0.3)
@@ -122,17 +122,6 @@ def optimise(size: int, steps: int) -> list[float]:
         descent.optimiser.set_learning_rate(0.05 * (1 - step / steps))
         errors.append(descent.step())
     return errors
-
-
-def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of each call, of which each round makes one; the first times are those of the first round."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            times[name].append((time.perf_counter() - start) * 1e3)
-    return times
 
 
 def spread(values: list[float]) -> str:

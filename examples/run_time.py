@@ -15,7 +15,6 @@ import json
 import re
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -37,6 +36,7 @@ from mcdenoise.models import (
     parts_of,
     pretrained_models,
 )
+from mcdenoise.turns import interleaved
 
 OIDN = (
     "oidn(quality=fast, auxiliary=noisy)",
@@ -66,17 +66,6 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
     precisions = PRECISIONS if model.needs.trainable else ("float32",)
     names = {precision: "" if precision == "float32" else f", {precision}" for precision in precisions}
     return {f"{spelling.name}{mark}": partial(call, precision) for precision, mark in names.items()}
-
-
-def interleaved(calls: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of each call in every round except the first."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds + 1):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            times[name].append((time.perf_counter() - start) * 1e3)
-    return {name: values[1:] for name, values in times.items()}
 
 
 def main() -> None:
@@ -109,7 +98,7 @@ def main() -> None:
     for spelt in options.models:
         calls |= calls_of(spelt, frame, options.threads)
 
-    times = interleaved(calls, options.rounds)
+    times = {name: later for name, (_, *later) in interleaved(calls, options.rounds).items()}
     unit = statistics.median(next(iter(times.values())))
     print(f"{options.size}, {options.threads} threads, {options.rounds} rounds, torch {torch.__version__}")
     print(f"{'milliseconds':<44}{'median':>8}{'quartiles':>16}{'/ first':>13}")

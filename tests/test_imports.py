@@ -36,6 +36,7 @@ ALLOWED: dict[str, set[str]] = {
     # It knows what a signal ends, and what must be tidied up then.
     "interruption": set(),
     "threads": set(),
+    "turns": set(),
     # Tasks run in other processes, whatever they do.
     "engines": {"errors", "interruption"},
     # Its files are written as all files are; it reads none of the data.

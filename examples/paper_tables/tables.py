@@ -25,10 +25,10 @@ All networks of a table have the same training settings, and their input is accu
 
 import argparse
 import sys
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import mean, median, quantiles
 from typing import Any, get_args
@@ -45,6 +45,7 @@ from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS
 from mcdenoise.models import Output, compared_models, create_model, describe_weights, parts_of
 from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.turns import interleaved
 
 PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SEEDS = (1, 2, 3)
@@ -199,13 +200,8 @@ def table_2(measured: Measured) -> Table:
         models[name] = next((part.inner for part in parts_of(made, Accumulated)), made)
         if isinstance(made, torch.nn.Module):
             made.eval().to(memory_format=torch.channels_last)
-    times: dict[str, list[float]] = {name: [] for name in models}
     with torch.inference_mode():
-        for _ in range(rounds + 1):
-            for name, model in models.items():
-                start = time.perf_counter()
-                model(frame)
-                times[name].append((time.perf_counter() - start) * 1e3)
+        times = interleaved({name: partial(model, frame) for name, model in models.items()}, rounds)
         for name, model in models.items():
             lower, _, upper = quantiles(times[name][1:], n=4)
             middle = median(times[name][1:])
