@@ -240,7 +240,7 @@ def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[
         folds = [
             measured.errors(scene, "cascaded", weights_of(fold / f"{run}-{SEEDS[0]}", "cascaded"))
             for scene in options.held_out
-            for fold in [fold_folder(options.runs, options.split, scene, options.scenes)]
+            for fold in [fold_folder(options.runs, options.split, scene, (*options.scenes, scene))]
         ]
         means = [measured.average(own) for own in seeds]
         averages[name] = measured.average(means)
