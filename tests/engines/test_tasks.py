@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -86,9 +87,14 @@ def test_a_driver_of_another_version_is_refused() -> None:
 
 def kill_children() -> int:
     """Kill every process that this one has started, whatever it is for, and return how many there were."""
-    found = [int(each) for path in Path("/proc/self/task").glob("*/children") for each in path.read_text().split()]
+    found: list[int] = []
+    for path in Path("/proc/self/task").glob("*/children"):
+        # A thread may end while it is read, and a process before it is killed.
+        with suppress(FileNotFoundError, ProcessLookupError):
+            found += map(int, path.read_text().split())
     for process in found:
-        os.kill(process, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
     return len(found)
 
 
