@@ -194,102 +194,70 @@ def _material(number: int, entry: dict[str, Any], images: dict[str, Any]) -> Any
     material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()
-    shader = (_pane if entry["type"] == "pane" else _principled)(tree, entry, images)
+    shader = _pane(tree, entry["pane"]) if "pane" in entry else _principled(tree, entry["inputs"], images)
     if "radiance" in entry:
-        strength = max(entry["radiance"])
-        lamp = tree.nodes.new("ShaderNodeEmission")
-        lamp.inputs["Color"].default_value = (*(channel / strength for channel in entry["radiance"]), 1)
-        lamp.inputs["Strength"].default_value = strength
+        strength: Any = max(entry["radiance"])
+        color = (*(channel / strength for channel in entry["radiance"]), 1)
         if entry["one_sided"]:
-            front = _math(tree, "MULTIPLY_ADD", tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"])
-            front.inputs[1].default_value, front.inputs[2].default_value = -strength, strength
-            tree.links.new(front.outputs[0], lamp.inputs["Strength"])
+            behind = _node(tree, "NewGeometry").outputs["Backfacing"]
+            strength = _math(tree, "MULTIPLY_ADD", behind, -strength, strength)
             material.cycles.emission_sampling = "FRONT"
-        both = tree.nodes.new("ShaderNodeAddShader")
-        tree.links.new(shader, both.inputs[0])
-        tree.links.new(lamp.outputs[0], both.inputs[1])
-        shader = both.outputs[0]
-    tree.links.new(shader, tree.nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+        lamp = _node(tree, "Emission", {"Color": color, "Strength": strength}).outputs[0]
+        shader = _node(tree, "AddShader", {0: shader, 1: lamp}).outputs[0]
+    _node(tree, "OutputMaterial", {"Surface": shader})
     return material
 
 
-_INPUTS = {
-    "base": "Base Color",
-    "roughness": "Roughness",
-    "metallic": "Metallic",
-    "specular": "Specular IOR Level",
-    "ior": "IOR",
-    "transmission": "Transmission Weight",
-    "coat": "Coat Weight",
-    "coat_roughness": "Coat Roughness",
-    "coat_ior": "Coat IOR",
-    "alpha": "Alpha",
-    "normal": "Normal",
-}
+def _node(tree: Any, kind: str, inputs: dict[Any, Any] | None = None, **settings: Any) -> Any:
+    """A new node; an input is a value or another node's output."""
+    node = tree.nodes.new(f"ShaderNode{kind}")
+    for name, value in settings.items():
+        setattr(node, name, value)
+    for key, value in (inputs or {}).items():
+        if isinstance(value, bpy.types.NodeSocket):
+            tree.links.new(value, node.inputs[key])
+        else:
+            node.inputs[key].default_value = value
+    return node
 
 
-def _principled(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:
-    node = tree.nodes.new("ShaderNodeBsdfPrincipled")
-    for key, name in _INPUTS.items():
-        if key not in entry:
-            continue
-        socket, value = node.inputs[name], entry[key]
-        if "texture" in value:
+def _math(tree: Any, operation: str, *inputs: Any) -> Any:
+    return _node(tree, "Math", dict(enumerate(inputs)), operation=operation).outputs[0]
+
+
+def _principled(tree: Any, inputs: dict[str, Any], images: dict[str, Any]) -> Any:
+    node = _node(tree, "BsdfPrincipled")
+    for name, value in inputs.items():
+        socket = node.inputs[name]
+        if isinstance(value, dict):
             color = _texture(tree, value, images)
-            if key == "normal":
-                bumps = tree.nodes.new("ShaderNodeNormalMap")
-                tree.links.new(color, bumps.inputs["Color"])
-                color = bumps.outputs["Normal"]
+            if name == "Normal":
+                color = _node(tree, "NormalMap", {"Color": color}).outputs["Normal"]
             tree.links.new(color, socket)
         elif socket.type == "RGBA":
-            socket.default_value = (*value["value"], 1)
+            socket.default_value = (*value, 1)
         else:
-            number = value["value"]
-            socket.default_value = number[0] if isinstance(number, list) else number
+            socket.default_value = value[0] if isinstance(value, list) else value
     return node.outputs[0]
 
 
 def _texture(tree: Any, value: dict[str, Any], images: dict[str, Any]) -> Any:
-    texture = tree.nodes.new("ShaderNodeTexImage")
-    texture.image, texture.interpolation, texture.extension = images[value["texture"]], "Linear", "REPEAT"
-    scaled = tree.nodes.new("ShaderNodeMapping")
-    scaled.inputs["Scale"].default_value = (*value["scale"], 1)
-    tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["UV"], scaled.inputs["Vector"])
-    tree.links.new(scaled.outputs[0], texture.inputs["Vector"])
-    return texture.outputs["Color"]
+    uv = _node(tree, "TexCoord").outputs["UV"]
+    scaled = _node(tree, "Mapping", {"Scale": (*value["scale"], 1), "Vector": uv}).outputs[0]
+    settings = {"image": images[value["texture"]], "interpolation": "Linear", "extension": "REPEAT"}
+    return _node(tree, "TexImage", {"Vector": scaled}, **settings).outputs["Color"]
 
 
-def _pane(tree: Any, entry: dict[str, Any], images: dict[str, Any]) -> Any:
+def _pane(tree: Any, ior: float) -> Any:
     """Glass without refraction: it reflects 2 F / (1 + F) of the light and transmits the rest."""
     # The Fresnel node inverts the index on the back side of a surface, but a pane has no inside.
-    behind = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
-    exponent = _math(tree, "MULTIPLY_ADD", behind)
-    exponent.inputs[1].default_value, exponent.inputs[2].default_value = -2.0, 1.0
-    index = _math(tree, "POWER", None)
-    index.inputs[0].default_value = entry["ior"]
-    tree.links.new(exponent.outputs[0], index.inputs[1])
-    fresnel = tree.nodes.new("ShaderNodeFresnel")
-    tree.links.new(index.outputs[0], fresnel.inputs["IOR"])
-    one_more, doubled = _math(tree, "ADD", fresnel.outputs[0]), _math(tree, "MULTIPLY", fresnel.outputs[0])
-    one_more.inputs[1].default_value, doubled.inputs[1].default_value = 1.0, 2.0
-    mirrored = _math(tree, "DIVIDE", doubled.outputs[0])
-    tree.links.new(one_more.outputs[0], mirrored.inputs[1])
-    glossy = tree.nodes.new("ShaderNodeBsdfGlossy")
-    glossy.inputs["Roughness"].default_value = 0
-    glossy.inputs["Color"].default_value = (1, 1, 1, 1)
-    mix = tree.nodes.new("ShaderNodeMixShader")
-    tree.links.new(mirrored.outputs[0], mix.inputs[0])
-    tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
-    tree.links.new(glossy.outputs[0], mix.inputs[2])
-    return mix.outputs[0]
-
-
-def _math(tree: Any, operation: str, first: Any) -> Any:
-    node = tree.nodes.new("ShaderNodeMath")
-    node.operation = operation
-    if first is not None:
-        tree.links.new(first, node.inputs[0])
-    return node
+    behind = _node(tree, "NewGeometry").outputs["Backfacing"]
+    index = _math(tree, "POWER", ior, _math(tree, "MULTIPLY_ADD", behind, -2.0, 1.0))
+    fresnel = _node(tree, "Fresnel", {"IOR": index}).outputs[0]
+    mirrored = _math(tree, "DIVIDE", _math(tree, "MULTIPLY", fresnel, 2.0), _math(tree, "ADD", fresnel, 1.0))
+    glossy = _node(tree, "BsdfGlossy", {"Roughness": 0, "Color": (1, 1, 1, 1)}).outputs[0]
+    clear = _node(tree, "BsdfTransparent").outputs[0]
+    return _node(tree, "MixShader", {0: mirrored, 1: clear, 2: glossy}).outputs[0]
 
 
 def _light(number: int, light: dict[str, Any]) -> Any:
@@ -303,7 +271,8 @@ def _light(number: int, light: dict[str, Any]) -> Any:
     if light["type"] == "spot":
         thing.matrix_world = Matrix((np.array(light["to_world"]) @ _CAMERA).tolist())
         data.spot_size = 2 * math.radians(light["cutoff"])
-        data.spot_blend = 1 - light["beam"] / light["cutoff"]
+        # Mitsuba's spots have three quarters of their cone with constant intensity.
+        data.spot_blend = 0.25
     else:
         thing.location = light["position"]
     return thing
@@ -316,16 +285,12 @@ def _world(sky: dict[str, Any] | None, images: dict[str, Any]) -> Any:
     background = tree.nodes["Background"]
     background.inputs["Color"].default_value = (*(sky or {}).get("value", (0, 0, 0)), 1)
     if sky is not None and "texture" in sky:
-        texture = tree.nodes.new("ShaderNodeTexEnvironment")
-        texture.image, texture.interpolation = images[sky["texture"]], "Linear"
-        # Blender's images are around z and begin at -x, Mitsuba's around y and begin at -z: (z, x, y) instead of (x, y,
-        # z).
-        parts, turned = tree.nodes.new("ShaderNodeSeparateXYZ"), tree.nodes.new("ShaderNodeCombineXYZ")
-        tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"], parts.inputs[0])
-        for old, new in ((2, 0), (0, 1), (1, 2)):
-            tree.links.new(parts.outputs[old], turned.inputs[new])
-        tree.links.new(turned.outputs[0], texture.inputs["Vector"])
-        tree.links.new(texture.outputs["Color"], background.inputs["Color"])
+        # Blender's images are around z and begin at -x, Mitsuba's around y and begin at -z: (z, x, y), not (x, y, z).
+        parts = _node(tree, "SeparateXYZ", {0: _node(tree, "TexCoord").outputs["Generated"]}).outputs
+        turned = _node(tree, "CombineXYZ", {0: parts[2], 1: parts[0], 2: parts[1]}).outputs[0]
+        settings = {"image": images[sky["texture"]], "interpolation": "Linear"}
+        color = _node(tree, "TexEnvironment", {"Vector": turned}, **settings).outputs["Color"]
+        tree.links.new(color, background.inputs["Color"])
     return world
 
 

@@ -30,17 +30,12 @@ from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder, describe, write_noisy, write_reference
+from mcdenoise.scenes.render.sequence import check_lowest
 from mcdenoise.scenes.takes.draw import Take
 
-# Names of the passes in Blender 4.5 and, if they differ, in 5.0.
-_PASSES = {
-    "Combined": ("Combined",),
-    "Denoising Albedo": ("Denoising Albedo",),
-    "Denoising Normal": ("Denoising Normal",),
-    "Depth": ("Depth",),
-    "Position": ("Position",),
-    "IndexOB": ("IndexOB", "Object Index"),
-}
+_PASSES = ("Combined", "Denoising Albedo", "Denoising Normal", "Depth", "Position", "IndexOB")
+# The name of a pass in Blender 5.0, where it is another than in 4.5.
+_RENAMED = {"IndexOB": "Object Index"}
 # Light passes, by the names in Blender's Python.
 _LIGHT = [
     *(f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")),
@@ -108,11 +103,8 @@ def render_cycles(
         InputError: a setting is invalid, Cycles does not support a part of the scene, Blender failed, or ``out`` cannot
             be written or holds a sequence with other settings.
     """
-    lowest = {"noise_seeds": (noise_seeds, 1), "reference_samples": (reference_samples, 0), "threads": (threads, 0)}
-    lowest |= {"seed": (seed, 0), "samples": (samples, 1)}
-    for name, (value, least) in lowest.items():
-        if value < least:
-            raise InputError(f"{name}: expected at least {least}, found {value}")
+    check_lowest(noise_seeds=(noise_seeds, 1), reference_samples=(reference_samples, 0), threads=(threads, 0))
+    check_lowest(seed=(seed, 0), samples=(samples, 1))
     count = len(take.cameras)
     if shutter is None:
         blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
@@ -167,77 +159,67 @@ def render_cycles(
             settings |= {"box": used == "box", "filter_width": _WIDTHS[used]}
             blender.ask("scene", folder=place, settings=settings)
 
-        def shot(number: int, samples: int, stream: int) -> dict[str, Image]:
+        def shot(number: int, samples: int, stream: int, back: Mapping[int, Array]) -> dict[str, Tensor]:
             noise = int(np.random.SeedSequence((seed, number, stream)).generate_state(1)[0] % 2**31)
             blender.ask("render", frame=number, samples=samples, seed=noise, out=str(file))
             images = _read(file, parts)
             file.unlink()
             advance(samples)
-            return images
+            buffers = buffers_of(images, take.cameras[number], back)
+            return {name: _tensor(image) for name, image in buffers.items()}
 
         # Render images with few samples first: a scene that stays in Cycles keeps the sampling pattern of the largest
         # number of samples so far, and the noise of a frame must not depend on previous renderings.
         for number, noise_seed in noisy:
             back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
-            seen = _View(take.cameras[number], size, back)
-            images = shot(number, samples, 1 + noise_seed if noise_seed else 0)
-            buffers = {name: _tensor(image) for name, image in seen.buffers(images).items()}
-            write_noisy(folder.path, number, noise_seed, buffers)
+            found = shot(number, samples, 1 + noise_seed if noise_seed else 0, back)
+            write_noisy(folder.path, number, noise_seed, found)
         for number in clean:
-            images = shot(number, clean_samples, _REFERENCE_STREAM)
-            seen = _View(take.cameras[number], size, {})
-            buffers = {name: _tensor(image) for name, image in seen.buffers(images).items()}
-            write_clean_features(folder.path, number, buffers["albedo"], buffers["normal"])
+            found = shot(number, clean_samples, _REFERENCE_STREAM, {})
+            write_clean_features(folder.path, number, found["albedo"], found["normal"])
             state = ReferenceState(clean_samples, 1, None)
-            write_reference(folder.path, number, buffers["color"], state)
+            write_reference(folder.path, number, found["color"], state)
             folder.note_reference(number, state)
     return folder.path
 
 
-# Buffers that every frame has, as `_View` returns them.
+# Buffers that every frame has, see `buffers_of`.
 _FEATURES = ("albedo", "normal", "position", "depth")
 
 
-class _View:
-    """Conversion of one frame's passes to buffers.
+def buffers_of(images: Mapping[str, Image], camera: Camera, back: Mapping[int, Array]) -> dict[str, Image]:
+    """Buffers in the BMFR layout from the passes of a frame, the color last.
 
     Args:
+        images: the passes by name.
         camera: camera of the frame.
-        size: width and height in pixels.
         back: for each object index, the transform of its points to the previous frame.
     """
-
-    def __init__(self, camera: Camera, size: tuple[int, int], back: Mapping[int, Array]) -> None:
-        self._camera, self._size, self._back = camera, size, back
-
-    def buffers(self, images: Mapping[str, Image]) -> dict[str, Image]:
-        """Buffers in the BMFR layout, the color last."""
-        width, height = self._size
-        pose, position, depth = self._camera.to_world, images["Position"], images["Depth"]
-        known = (~nothing_hit(depth)) & np.isfinite(position).all(-1, keepdims=True)
-        # Like the reader for a user's file: put the sky far behind everything, so that it can be reprojected.
-        rays = pixel_rays(self._camera, width, height)
-        axis = (rays.directions @ pose[:3, 2]).reshape(height, width, 1)
-        far = _SKY * float(depth[known].max(initial=1))
-        sky = rays.origin + far / axis * rays.directions.reshape(height, width, 3)
-        position = np.where(known, position, sky)
-        # In Blender's Denoising Normal, x points right, y up, and z into the scene.
-        normal = np.nan_to_num(images["Denoising Normal"], nan=0, posinf=0, neginf=0) * (-1, 1, 1)
-        buffers: dict[str, Any] = {
-            "albedo": np.clip(np.nan_to_num(images["Denoising Albedo"], nan=0, posinf=1, neginf=0), 0, 1),
-            "normal": np.clip(normal @ pose[:3, :3].T, -1, 1),
-            "position": position,
-            "depth": np.where(known, depth, np.inf),
-        }
-        if self._back:
-            before = position.copy()
-            index = np.rint(images["IndexOB"][..., 0])
-            for number, back in self._back.items():
-                own = (index == number) & known[..., 0]
-                before[own] = position[own] @ back[:3, :3].T + back[:3, 3]
-            buffers["previous_position"] = before
-        buffers |= {name: images[name] for name in ("diffuse", "specular") if name in images}
-        return {**buffers, "color": images["Combined"][..., :3]}
+    pose, position, depth = camera.to_world, images["Position"], images["Depth"]
+    height, width = depth.shape[:2]
+    known = (~nothing_hit(depth)) & np.isfinite(position).all(-1, keepdims=True)
+    # Like the reader for a user's file: put the sky far behind everything, so that it can be reprojected.
+    rays = pixel_rays(camera, width, height)
+    axis = (rays.directions @ pose[:3, 2]).reshape(height, width, 1)
+    far = _SKY * float(depth[known].max(initial=1))
+    position = np.where(known, position, rays.origin + far / axis * rays.directions.reshape(height, width, 3))
+    # In Blender's Denoising Normal, x points right, y up, and z into the scene.
+    normal = np.nan_to_num(images["Denoising Normal"], nan=0, posinf=0, neginf=0) * (-1, 1, 1)
+    buffers: dict[str, Any] = {
+        "albedo": np.clip(np.nan_to_num(images["Denoising Albedo"], nan=0, posinf=1, neginf=0), 0, 1),
+        "normal": np.clip(normal @ pose[:3, :3].T, -1, 1),
+        "position": position,
+        "depth": np.where(known, depth, np.inf),
+    }
+    if back:
+        before = position.copy()
+        index = np.rint(images["IndexOB"][..., 0])
+        for number, matrix in back.items():
+            own = (index == number) & known[..., 0]
+            before[own] = position[own] @ matrix[:3, :3].T + matrix[:3, 3]
+        buffers["previous_position"] = before
+    buffers |= {name: images[name] for name in ("diffuse", "specular") if name in images}
+    return {**buffers, "color": images["Combined"][..., :3]}
 
 
 def _back(move: Array, number: int) -> Array:
@@ -271,10 +253,8 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
     found: dict[str, Image] = {}
     for split in find_splits(listed, layers["Combined"], {})[:1] if with_parts else []:
         found |= split.sums(read_layers(path, split.layers))
-    for name, names in _PASSES.items():
-        layer = next((layers[each] for each in names if each in layers), None)
-        if layer is None and len(layers) == 1:
-            (layer,) = layers.values()
+    for name in _PASSES:
+        layer = layers.get(name) or layers.get(_RENAMED.get(name, ""))
         if layer is None:
             raise InputError(
                 f"Blender's pass '{name}': expected it in the frame just rendered, found {', '.join(layers)}"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,171 +32,94 @@ class Mesh:
     vertices: Array
     triangles: NDArray[np.int64]
     uv: Array
-    smooth: bool
-    closed: bool
+    smooth: bool = False
+    closed: bool = False
 
     def placed(self, matrix: Array) -> Mesh:
         """Transform the mesh by an affine ``(4, 4)`` matrix for column vectors."""
-        vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+        moved = replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
         if np.linalg.det(matrix[:3, :3]) > 0:
-            return Mesh(vertices, self.triangles, self.uv, self.smooth, self.closed)
+            return moved
         # A reflection would turn the mesh inside out.
-        return Mesh(vertices, self.triangles[:, ::-1], self.uv[:, ::-1], self.smooth, self.closed)
+        return replace(moved, triangles=self.triangles[:, ::-1], uv=self.uv[:, ::-1])
 
 
-def tessellate(kind: str, where: str, *, shines: bool = False) -> Mesh:
+def tessellate(kind: str, *, shines: bool = False) -> Mesh:
     """Tessellate a shape plugin of Mitsuba: ``cube``, ``sphere``, ``cylinder``, ``disk`` or ``rectangle``.
 
     Args:
         kind: name of the plugin.
-        where: description of the object, for the error.
         shines: whether it is a lamp, which gets fewer triangles.
 
     Raises:
         InputError: the shape is not supported.
 
     Example:
-        >>> tessellate("cube", "a box").triangles.shape
+        >>> tessellate("cube").triangles.shape
         (12, 3)
     """
-    try:
-        return _SHAPES[kind](_AROUND_A_LAMP if shines else _AROUND)
-    except KeyError as error:
-        raise InputError(
-            f"{where}: expected a shape that Cycles can be given ({', '.join(_SHAPES)}), found '{kind}'"
-        ) from error
+    around = _AROUND_A_LAMP if shines else _AROUND
+    if kind == "cube":
+        return _cube()
+    if kind == "sphere":
+        return replace(_grid(around, around // 2, _on_sphere, down=True), smooth=True, closed=True)
+    if kind == "cylinder":
+        return replace(_grid(around, 1, lambda u, v: (*_circle(u), v)), smooth=True)
+    if kind == "disk":
+        # u is the radius and v the angle.
+        return _grid(1, around, lambda u, v: (*(u * side for side in _circle(v)), 0 * u))
+    if kind == "rectangle":
+        return _grid(1, 1, lambda u, v: (2 * u - 1, 2 * v - 1, 0 * u))
+    raise InputError(f"expected a shape that Cycles can be given, found '{kind}'")
 
 
-def _sphere(around: int) -> Mesh:
-    """Radius 1; u around the z axis, v from the pole at +z down. The poles have one vertex each."""
-    down = around // 2
-    polar = np.arange(1, down) * math.pi / down
-    angle = np.arange(around) * 2 * math.pi / around
-    ring = np.stack(
-        [
-            np.sin(polar)[:, None] * np.cos(angle),
-            np.sin(polar)[:, None] * np.sin(angle),
-            np.cos(polar)[:, None] + 0 * angle,
-        ],
-        -1,
-    )
-    vertices = np.concatenate([ring.reshape(-1, 3), [(0, 0, 1), (0, 0, -1)]])
-    top, bottom = len(vertices) - 2, len(vertices) - 1
-    triangles: list[tuple[int, int, int]] = []
-    uv: list[tuple[tuple[float, float], ...]] = []
-    for column in range(around):
-        after = (column + 1) % around
-        left, middle, right = (x / around for x in (column, column + 0.5, column + 1))
-        triangles.append((top, column, after))
-        uv.append(((middle, 0.0), (left, 1 / down), (right, 1 / down)))
-        for row in range(down - 2):
-            a, b, c, d = (r * around + x for r, x in ((row, column), (row + 1, column), (row + 1, after), (row, after)))
-            high, low = (row + 1) / down, (row + 2) / down
-            triangles += [(a, b, c), (a, c, d)]
-            uv += [((left, high), (left, low), (right, low)), ((left, high), (right, low), (right, high))]
-        last = (down - 2) * around
-        triangles.append((last + column, bottom, last + after))
-        uv.append(((left, 1 - 1 / down), (middle, 1.0), (right, 1 - 1 / down)))
-    return Mesh(vertices, np.array(triangles), np.array(uv), smooth=True, closed=True)
+def _circle(turn: Array) -> tuple[Array, Array]:
+    return np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
 
 
-def _cylinder(around: int) -> Mesh:
-    """An open tube of radius 1 from z = 0 to 1; u around the axis, v along it."""
-    angle = np.arange(around) * 2 * math.pi / around
-    circle = np.stack([np.cos(angle), np.sin(angle)], -1)
-    vertices = np.concatenate([np.column_stack([circle, np.full(around, z)]) for z in (0.0, 1.0)])
-    first = np.arange(around)
-    after = (first + 1) % around
-    triangles = np.concatenate(
-        [
-            np.stack([first, after, after + around], -1),
-            np.stack([first, after + around, first + around], -1),
-        ]
-    )
-    left, right = first / around, (first + 1) / around
-    low, high = np.zeros(around), np.ones(around)
-
-    def corner(u: Array, v: Array) -> Array:
-        return np.stack([u, v], -1)
-
-    uv = np.concatenate(
-        [
-            np.stack([corner(left, low), corner(right, low), corner(right, high)], 1),
-            np.stack([corner(left, low), corner(right, high), corner(left, high)], 1),
-        ]
-    )
-    return Mesh(vertices, triangles, uv, smooth=True, closed=False)
+def _on_sphere(u: Array, v: Array) -> tuple[Array, ...]:
+    return (*(np.sin(np.pi * v) * side for side in _circle(u)), np.cos(np.pi * v))
 
 
-def _disk(around: int) -> Mesh:
-    """Radius 1, facing +z; u is the radius and v the angle."""
-    angle = np.arange(around) * 2 * math.pi / around
-    vertices = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1), [(0, 0, 0)]])
-    first = np.arange(around)
-    triangles = np.stack([np.full(around, around), first, (first + 1) % around], -1)
-    turned = np.stack([(first + 0.5) / around, first / around, (first + 1) / around], -1)
-    radius = np.broadcast_to((0.0, 1.0, 1.0), turned.shape)
-    return Mesh(vertices, triangles, np.stack([radius, turned], -1), smooth=False, closed=False)
+def _grid(columns: int, rows: int, place: Callable[[Array, Array], tuple[Array, ...]], *, down: bool = False) -> Mesh:
+    """Triangles of a grid over u and v from 0 to 1; points in the same place are one vertex.
+
+    Args:
+        columns: steps of u.
+        rows: steps of v.
+        place: the points of u and v.
+        down: whether v falls from row to row, which turns the outside to the other side.
+    """
+    v, u = np.mgrid[0 : 1 : (rows + 1) * 1j, 0 : 1 : (columns + 1) * 1j].reshape(2, -1)
+    v = 1 - v if down else v
+    points = np.stack(place(u, v), -1)
+    _, kept, names = np.unique(points.round(9) + 0.0, axis=0, return_index=True, return_inverse=True)
+    first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    across = first + columns + 2
+    corners = np.stack([first, first + 1, across, first, across, across - 1], -1).reshape(-1, 3)
+    triangles = names.reshape(-1)[corners]
+    whole = (triangles != np.roll(triangles, 1, axis=1)).all(1)
+    return Mesh(points[kept], triangles[whole], np.stack([u, v], -1)[corners][whole])
 
 
-def _rectangle(around: int) -> Mesh:
-    """From -1 to 1 in x and y, facing +z."""
-    vertices = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype=np.float64)
-    triangles = np.array([(0, 1, 2), (0, 2, 3)])
-    return Mesh(vertices, triangles, (vertices[triangles][..., :2] + 1) / 2, smooth=False, closed=False)
-
-
-def _cube(around: int) -> Mesh:
+def _cube() -> Mesh:
     """From -1 to 1 in every axis; each face has the whole of a texture."""
-    corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
-    vertices: list[Array] = []
-    triangles: list[list[int]] = []
-    uv: list[Array] = []
+    side = tessellate("rectangle")
+    faces: list[Mesh] = []
     for axis in range(3):
-        for sign in (-1.0, 1.0):
-            face = np.empty((4, 3))
-            face[:, axis] = sign
-            order = ((axis + 1) % 3, (axis + 2) % 3)
-            face[:, order] = 2 * corners - 1
-            inside_out = sign < 0
-            for triangle in ((0, 1, 2), (0, 2, 3)):
-                chosen = list(triangle[::-1] if inside_out else triangle)
-                triangles.append([4 * len(vertices) + k for k in chosen])
-                uv.append(corners[chosen])
-            vertices.append(face)
-    return Mesh(np.concatenate(vertices), np.array(triangles), np.array(uv), smooth=False, closed=True)
-
-
-_SHAPES: dict[str, Callable[[int], Mesh]] = {
-    "cube": _cube,
-    "sphere": _sphere,
-    "cylinder": _cylinder,
-    "disk": _disk,
-    "rectangle": _rectangle,
-}
+        for sign in (1, -1):
+            outside = slice(None, None, sign)
+            vertices = np.roll(side.vertices + np.array((0, 0, sign)), axis + 1, axis=1)
+            triangles = side.triangles[:, outside] + 4 * len(faces)
+            faces.append(Mesh(vertices, triangles, side.uv[:, outside]))
+    vertices, triangles, uv = (
+        np.concatenate([getattr(face, name) for face in faces]) for name in ("vertices", "triangles", "uv")
+    )
+    return Mesh(vertices, triangles, uv, closed=True)
 
 
 def of_triangles(mesh: assets.Mesh) -> Mesh:
     """The triangles of a model, with texture coordinates as Mitsuba has them, whose images begin at the top."""
-    uv = np.zeros((len(mesh.vertices), 2))
-    if mesh.uv is not None:
-        uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1).astype(np.float64)
-    return Mesh(
-        mesh.vertices.astype(np.float64),
-        mesh.faces.astype(np.int64),
-        uv[mesh.faces],
-        mesh.normals is not None,
-        closed=False,
-    )
-
-
-def as_matrix(value: Any, where: str) -> Array:
-    """Check a ``(4, 4)`` transform of a dictionary.
-
-    Raises:
-        InputError: it is not a finite matrix of that shape.
-    """
-    matrix = np.asarray(value, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise InputError(f"{where}: expected a finite 4x4 matrix for 'to_world', found shape {matrix.shape}")
-    return matrix
+    uv: NDArray[Any] = np.zeros((len(mesh.vertices), 2)) if mesh.uv is None else mesh.uv * (1, -1) + (0, 1)
+    smooth = mesh.normals is not None
+    return Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64), uv[mesh.faces], smooth)

@@ -102,7 +102,7 @@ def render_sequence(
     count = len(cameras) if frames is None else min(frames, len(cameras))
     references = frozenset(range(count) if reference_frames is None else reference_frames)
     _check_settings(size, count, references, noise_level)
-    _check_lowest(
+    check_lowest(
         spp=(spp, 1),
         noise_seeds=(noise_seeds, 1),
         reference_spp=(reference_spp, 1),
@@ -200,7 +200,8 @@ def _check_settings(size: tuple[int, int], count: int, references: frozenset[int
         raise InputError(f"noise_level: expected more than 0 and less than 1, found {noise_level:g}")
 
 
-def _check_lowest(**settings: tuple[int, int]) -> None:
+def check_lowest(**settings: tuple[int, int]) -> None:
+    """Check that each setting has at least a value; they are pairs of both."""
     for name, (value, lowest) in settings.items():
         if value < lowest:
             raise InputError(f"{name}: expected at least {lowest}, found {value}")
