@@ -14,7 +14,9 @@ import subprocess
 import sys
 import time
 import traceback
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -181,8 +183,11 @@ def fork(task: dict, room: int) -> int:
 def run(command: list[str]) -> int:
     import table
 
+    from mcdenoise import engines
     from mcdenoise.cli import main
 
+    # A spawned worker imports everything again, for seconds; this process has no threads, so it can be forked.
+    engines._pool = lambda: ProcessPoolExecutor(1, get_context("fork"), initializer=engines.prepare_worker)
     try:
         if command[0] == "reader":
             return table.read(command[1], Path(command[2]))

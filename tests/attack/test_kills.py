@@ -8,7 +8,7 @@ from attacker import Attacker, aged, unreadable
 from server import Process
 from table import COMMANDS
 
-KILLED = {"denoise": 50, "denoise layers": 30, "denoise again": 30, "film": 16, "film again": 8, "train": 10}
+KILLED = {"denoise": 18, "denoise layers": 9, "denoise again": 9, "film": 9, "film again": 6, "train": 6}
 
 
 @pytest.mark.attack

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from attacker import Attacker, names, unreadable
 from mutations import PLACES
-from table import COMMANDS
+from table import COMMANDS, SLOW
 
 NOBODY = 65534
 
@@ -90,8 +90,7 @@ def test_full_disk(attacker: Attacker, name: str) -> None:
     """With a limited file size no incomplete files are left, and running again without the limit succeeds."""
     failed, command, g = [], COMMANDS[name], np.random.default_rng(0)
     attacker.expected(name)
-    slow = name in ("train", "film")
-    limits = g.integers(1, 400_000 if name == "train" else 2500, 6 if slow else 30)
+    limits = g.integers(1, 400_000 if name == "train" else 2500, 4 if name in SLOW else 12)
     for limit in map(int, limits):
         folder = attacker.fresh(command.needs)
         # Discard the output, whose file has the same limit.
