@@ -16,7 +16,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
+from mcdenoise.scenes.render.tracer import Tracer
 
 FILTERS = ("box", "gaussian", "tent", "mitchell")
 # Number of samples in one pass over the image, limited by a laptop's memory.
@@ -75,16 +75,16 @@ class FilmRenderer:
         """The best number of samples per pixel for one call."""
         return max(1, _SAMPLES // (self._size[0] * self._size[1]))
 
-    def radiance(self, camera: Camera, paths: int, seed: Sequence[int]) -> Array:
-        """Mean radiance ``(H*W, 3)`` of stratified samples; some filters give negative values.
+    def radiance(self, camera: Camera, paths: int, seed: Sequence[int], stratified: bool) -> Array:
+        """Mean radiance ``(H*W, 3)`` of samples; some filters give negative values.
 
         Args:
             camera: the camera.
-            paths: samples per pixel. Other numbers than ``STRATIFIED_PATHS`` are sampled independently.
+            paths: samples per pixel.
             seed: noise seed.
+            stratified: whether the samples of a pixel are stratified.
         """
-        sampler = "multijitter" if paths == STRATIFIED_PATHS else "independent"
-        return self._render(self._color, camera, sampler, paths, seed)
+        return self._render(self._color, camera, "multijitter" if stratified else "independent", paths, seed)
 
     def frame(self, camera: Camera, before: dict[str, Array], paths: int, seed: Sequence[int]) -> dict[str, Array]:
         """Color and features of the same independent samples, by buffer names, ``(H*W, C)``.

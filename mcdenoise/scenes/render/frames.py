@@ -1,4 +1,4 @@
-"""Rendering the missing files of one frame of a sequence."""
+"""Rendering the missing files of one frame of a sequence, here or in a worker that loads the scene itself."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -18,37 +18,35 @@ from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.film import Film, FilmRenderer
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_noisy, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.scenes.render.loading import Scene
 from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
 
 # With fewer paths, rare bright ones have not been hit yet, and the noise is underestimated.
 _FEWEST_PATHS_IN_A_HALF = 16
 _SMALLEST_HALF = 1 / 8
 _SECONDS_BETWEEN_SAVES = 60.0
+# Number of samples of a reference's features, and a seed number that its passes do not use.
+_CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
+# The last scene that this worker has loaded, by the folder of its frames: a folder has one scene.
+_loaded: dict[Path, Tracer] = {}
 
 Seed: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameJob:
-    """Settings common to all frames, and the state on disk; see :func:`mcdenoise.scenes.render.render_sequence`.
+    """Settings common to all frames, those of :func:`mcdenoise.scenes.render.render_sequence`, and the state on disk.
 
     Args:
         folder: ``inputs`` of the sequence.
-        cameras: camera of each frame.
-        moves: transforms of each moving object.
-        size: width and height in pixels.
         reach: distance of the background in scene units.
-        spp: paths per pixel of the noisy colours.
-        noise_seeds: number of noise seeds.
-        reference_spp: paths per pixel of a finished reference.
-        noise_level: or its estimated noise.
         references: frames that get a reference.
         started: progress of the references on disk.
-        seed: noise seed.
-        film: filter and lens of jittered samples; ``None`` for samples at the pixel centre.
-        keep_samples: whether the single samples of the noisy colours are also written.
     """
 
+    scene: Scene
+    variant: str
+    max_depth: int
     folder: Path
     cameras: list[Camera]
     moves: dict[str, Array]
@@ -64,30 +62,33 @@ class FrameJob:
     film: Film | None = None
     keep_samples: bool = False
 
-    def is_finished(self, number: int) -> bool:
-        """Whether all files of a frame exist."""
-        colors = all(self.has_color(number, noise_seed) for noise_seed in range(self.noise_seeds))
-        folders = {0, *(range(self.noise_seeds) if self.film is not None else ())}
-        features = all(self.has_features(number, noise_seed) for noise_seed in folders)
-        return colors and features and (number not in self.references or self.has_reference(number))
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of everything but colors and reference."""
+        return ("albedo", "normal", "position", "depth", *(["previous_position"] if self.moves else []))
 
-    def has_color(self, number: int, noise_seed: int) -> bool:
-        """Whether a frame has a complete noisy colour of a noise seed."""
-        return has_buffer(noise_seed_folder(self.folder, noise_seed), number, "color", self.size)
+    @property
+    def noisy(self) -> tuple[str, ...]:
+        """Names of what every noise seed has."""
+        return ("color",) if self.film is None else ("color", *self.features)
 
-    def has_features(self, number: int, noise_seed: int = 0) -> bool:
-        """Whether a frame has all features of a noise seed, that is, everything but colours and reference."""
+    def has(self, number: int, noise_seed: int, names: tuple[str, ...]) -> bool:
+        """Whether a frame has complete buffers of a noise seed."""
         folder = noise_seed_folder(self.folder, noise_seed)
-        names = ["albedo", "normal", "position", "depth", *(["previous_position"] if self.moves else [])]
         return all(has_buffer(folder, number, name, self.size) for name in names)
 
-    def has_reference(self, number: int) -> bool:
-        """Whether a frame has a finished reference."""
+    def is_finished(self, number: int) -> bool:
+        """Whether all files of a frame exist."""
+        noisy = all(self.has(number, noise_seed, self.noisy) for noise_seed in range(self.noise_seeds))
+        return noisy and self.has(number, 0, self.features) and not self.wants_reference(number)
+
+    def wants_reference(self, number: int) -> bool:
+        """Whether the reference of a frame is missing or unfinished."""
         state = self.started.get(number)
-        if state is None:
-            return False
+        if number not in self.references or state is None:
+            return number in self.references
         reliable = state.spp >= 2 * _FEWEST_PATHS_IN_A_HALF
-        return self.is_good(state.spp, state.noise if reliable else None)
+        return not self.is_good(state.spp, state.noise if reliable else None)
 
     def is_good(self, spp: int, noise: float | None) -> bool:
         """Whether this number of paths, or this noise, is sufficient for a reference."""
@@ -96,16 +97,25 @@ class FrameJob:
 
     def paths_there(self) -> int:
         """Number of paths per pixel that are already on disk, summed over all frames."""
-        frames = range(len(self.cameras))
-        colors = sum(self.has_color(number, k) for number in frames for k in range(self.noise_seeds))
+        colors = sum(self.has(n, k, ("color",)) for n in range(len(self.cameras)) for k in range(self.noise_seeds))
         states = [(number, self.started[number]) for number in self.references if number in self.started]
         return colors * self.spp + sum(
-            self.reference_spp if self.has_reference(number) else state.spp for number, state in states
+            state.spp if self.wants_reference(number) else self.reference_spp for number, state in states
         )
 
 
+def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:
+    """A task: :func:`render_frame` by the scene that this worker has loaded, if it is the same."""
+    if job.folder not in _loaded:
+        _loaded.clear()
+        _loaded[job.folder] = Tracer(job.scene, job.variant, job.max_depth, job.moves)
+    return render_frame(job, _loaded[job.folder], number, lambda paths: None)
+
+
 def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[int], None]) -> ReferenceState | None:
-    """Write the missing files of a frame. The first colour is last: a frame that has it is complete.
+    """Write the missing files of a frame. The first color is last: a frame that has it is complete.
+
+    On a film, every noise seed has the features of its own samples.
 
     Args:
         job: settings common to all frames.
@@ -119,83 +129,57 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
     Raises:
         InputError: a file cannot be written, or the unfinished reference is damaged.
     """
-    width, height = job.size
     tracer.place(number)
-    wanted = number in job.references and not job.has_reference(number)
-    if job.film is not None:
-        return _render_filtered(
-            job, FilmRenderer(tracer, job.film, job.size, job.reach), tracer, number, advance, wanted
-        )
-    rays = pixel_rays(job.cameras[number], width, height)
-    if not job.has_features(number):
-        for name, values in _features(job, tracer, number, rays).items():
+    camera, back = job.cameras[number], _moved_back(job, number)
+    rays = pixel_rays(camera, *job.size)
+    film = None if job.film is None else FilmRenderer(tracer, job.film, job.size, job.reach)
+    if film is None and not job.has(number, 0, job.features):
+        for name, values in _features(job, tracer, number, rays, back).items():
             write_buffer(job.folder, number, name, _image(values, job.size))
     state = None
-    if wanted:
-        trace = partial(tracer.radiance, rays)
-        state = _refine_reference(job, lambda n, seed, even: trace(n, seed, stratified=even), number, advance)
-    for noise_seed in reversed(range(job.noise_seeds)):
-        if not job.has_color(number, noise_seed):
-            color, samples = _color(job, tracer, rays, (job.seed, number, _stream(noise_seed)), advance)
-            own = {"samples": torch.stack([_image(each, job.size) for each in samples], 1)} if samples else {}
-            write_noisy(job.folder, number, noise_seed, {**own, "color": _image(color, job.size)})
-    return state
+    if job.wants_reference(number):
+        trace = partial(tracer.radiance, rays) if film is None else partial(film.radiance, camera)
+        state = _refine_reference(job, trace, number, advance)
+        if film is not None:
+            clean = film.frame(camera, {}, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
+            write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
+    per_pass = min(job.spp, tracer.paths_per_pass(rays) if film is None else film.paths_per_pass())
 
+    def noisy(paths: int, seed: Seed) -> dict[str, Array]:
+        if film is None:
+            return {"color": tracer.radiance(rays, paths, seed, False)}
+        return film.frame(camera, {name: back[name] for name in tracer.movers}, paths, seed)
 
-def _render_filtered(
-    job: FrameJob,
-    film: FilmRenderer,
-    tracer: Tracer,
-    number: int,
-    advance: Callable[[int], None],
-    wanted: bool,
-) -> ReferenceState | None:
-    """Like :func:`render_frame`, but on a film: every noise seed has the features of its own samples."""
-    camera = job.cameras[number]
-    state = None
-    if wanted:
-        state = _refine_reference(job, lambda n, seed, _: film.radiance(camera, n, seed), number, advance)
-        clean = film.frame(camera, {}, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
-        write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
-    back = {name: matrix for name, matrix in _moved_back(job, number).items() if name in tracer.movers}
     for noise_seed in reversed(range(job.noise_seeds)):
-        if job.has_color(number, noise_seed) and job.has_features(number, noise_seed):
+        if job.has(number, noise_seed, job.noisy):
             continue
-        total: dict[str, Array] = {}
-        per_pass = 1 if job.keep_samples else film.paths_per_pass()
+        total: dict[str, Any] = {}
         kept: list[torch.Tensor] = []
-        for index, start in enumerate(range(0, job.spp, per_pass)):
-            paths = min(per_pass, job.spp - start)
-            seed = (job.seed, number, _stream(noise_seed), index)
-            found = film.frame(camera, back, paths, seed)
+        # The stream 1 belongs to the reference.
+        seed = (job.seed, number, 1 + noise_seed if noise_seed else 0)
+        for index, start in enumerate(range(0, job.spp, 1 if job.keep_samples else per_pass)):
+            paths = 1 if job.keep_samples else min(per_pass, job.spp - start)
+            found = noisy(paths, (*seed, index))
             for name, values in found.items():
-                total[name] = total.get(name, 0) + values * (paths / job.spp)
+                total[name] = total.get(name, 0) + paths * values
             if job.keep_samples:
-                kept.append(torch.cat([_image(found[name], job.size) for name in ("color", *FEATURES)], 1))
+                names = [name for name in ("color", *FEATURES) if name in found]
+                kept.append(torch.cat([_image(found[name], job.size) for name in names], 1))
             advance(paths)
-        images = {name: _image(total[name], job.size) for name in sorted({*total} - {"color"})}
+        color = _image(total.pop("color") / job.spp, job.size)
+        images = {name: _image(total[name] / job.spp, job.size) for name in sorted(total)}
         images |= {"samples": torch.stack(kept, 1)} if kept else {}
-        images["color"] = _image(total["color"], job.size)
-        write_noisy(job.folder, number, noise_seed, images)
+        write_noisy(job.folder, number, noise_seed, {**images, "color": color})
     return state
 
 
-# Number of samples of a reference's features, and a seed number that its passes do not use.
-_CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
-
-
-def _stream(noise_seed: int) -> int:
-    # The stream 1 belongs to the reference.
-    return 1 + noise_seed if noise_seed else 0
-
-
-def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays) -> dict[str, Array]:
+def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays, back: dict[str, Array]) -> dict[str, Array]:
     hits = tracer.features(rays)
     position = rays.origin + np.minimum(hits.distance, job.reach)[:, None] * rays.directions
     depth = (position - rays.origin) @ job.cameras[number].to_world[:3, 2]
     features = {"albedo": hits.albedo, "normal": hits.normal, "position": position, "depth": depth}
     if job.moves:
-        before, back = position.copy(), _moved_back(job, number)
+        before = position.copy()
         for index, identity in enumerate(tracer.movers):
             hit = hits.mover == index
             before[hit] = position[hit] @ back[identity][:3, :3].T + back[identity][:3, 3]
@@ -207,26 +191,12 @@ def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
     """For each moving object, the ``(4, 4)`` transform of its points to the previous frame."""
     # The first frame has no previous one; the transform to itself is the identity.
     earlier = max(number - 1, 0)
-    still = {name: np.array_equal(moved[earlier], moved[number]) for name, moved in job.moves.items()}
     return {
-        name: np.eye(4) if still[name] else moved[earlier] @ np.linalg.inv(moved[number])
+        name: np.eye(4)
+        if np.array_equal(moved[earlier], moved[number])
+        else moved[earlier] @ np.linalg.inv(moved[number])
         for name, moved in job.moves.items()
     }
-
-
-def _color(
-    job: FrameJob, tracer: Tracer, rays: PixelRays, seed: tuple[int, int, int], advance: Callable[[int], None]
-) -> tuple[Array, list[Array]]:
-    """The mean radiance of all paths and, if they are kept, the radiance of each path."""
-    per_pass = 1 if job.keep_samples else min(job.spp, tracer.paths_per_pass(rays))
-    total, samples = np.zeros_like(rays.directions), []
-    for number, start in enumerate(range(0, job.spp, per_pass)):
-        paths = min(per_pass, job.spp - start)
-        radiance = tracer.radiance(rays, paths, (*seed, number))
-        total += paths * radiance
-        samples += [radiance] if job.keep_samples else []
-        advance(paths)
-    return total / job.spp, samples
 
 
 def _refine_reference(

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
-from mcdenoise.engines import Engine, LocalEngine
+from mcdenoise.engines import Engine, Job, LocalEngine, Task, run_jobs
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder, describe
-from mcdenoise.scenes.render.frames import FrameJob, render_frame
+from mcdenoise.scenes.render.frames import FrameJob, render_frame, render_frame_task
 from mcdenoise.scenes.render.loading import Scene, choose_variant
-from mcdenoise.scenes.render.tasks import TracerSource, render_on_engine
-from mcdenoise.scenes.render.tracer import RR_DEPTH, STRATIFIED_PATHS
+from mcdenoise.scenes.render.tracer import RR_DEPTH, STRATIFIED_PATHS, Tracer
 
 _LARGEST_SIDE = 16384
 
@@ -110,12 +110,17 @@ def render_sequence(
         max_depth=(max_depth, 1),
         workers=(workers, 1),
     )
-    source = TracerSource(scene, choose_variant(variant), max_depth, checked_moves)
+    variant = choose_variant(variant)
     if workers > 1 and engine is None:
         engine = LocalEngine(workers)
     if engine is not None:
-        source.check_portable()
-    tracer = source.tracer()
+        try:
+            ForkingPickler.dumps(scene)
+        except Exception as error:  # a third-party object may raise anything
+            raise InputError(
+                f"scene dictionary: expected plain Python and numpy for more than one worker, found {error}"
+            ) from error
+    tracer = Tracer(scene, variant, max_depth, checked_moves)
     reach = tracer.reach(cameras)
     tracer.place(0)
     distance = tracer.features(pixel_rays(cameras[0], width, height)).distance
@@ -143,6 +148,9 @@ def render_sequence(
     )
     folder = SequenceFolder(Path(out), settings, BY_MITSUBA | (ON_A_FILM if film is not None else {}))
     job = FrameJob(
+        scene=scene,
+        variant=variant,
+        max_depth=max_depth,
         folder=folder.path,
         cameras=cameras,
         moves=checked_moves,
@@ -177,13 +185,32 @@ def render_sequence(
             if state is not None:
                 folder.note_reference(number, state)
 
-        render_on_engine(source, job, missing, engine, finish)
+        _render_on_engine(job, missing, engine, finish)
     else:
         for number in missing:
             state = render_frame(job, tracer, number, advance)
             if state is not None:
                 folder.note_reference(number, state)
     return folder.path
+
+
+def _render_on_engine(
+    job: FrameJob, numbers: Sequence[int], engine: Engine, on_frame: Callable[[int, ReferenceState | None], None]
+) -> None:
+    """Render frames, each a task of an engine; the error names the first that failed, when all others are finished."""
+    failed: list[str] = []
+
+    def one(number: int) -> Job:
+        [(state, reason)] = yield [Task(render_frame_task, (job, number))]
+        if reason is None:
+            on_frame(number, state)
+        else:
+            failed.append(f"frame {number}: {reason}")
+
+    run_jobs(engine, map(one, numbers))
+    if failed:
+        others = f"; {len(failed) - 1} more frames failed" if len(failed) > 1 else ""
+        raise InputError(f"{failed[0]}{others}; finished frames are kept")
 
 
 def _check_settings(size: tuple[int, int], count: int, references: frozenset[int], noise_level: float | None) -> None:

@@ -144,7 +144,7 @@ class Tracer:
         """The best number of independent paths per ray for one call of :meth:`radiance`."""
         return _SCALAR_PASS if self._scalar else max(1, _WAVEFRONT // len(rays.directions))
 
-    def radiance(self, rays: PixelRays, paths: int, seed: Sequence[int], *, stratified: bool = False) -> Array:
+    def radiance(self, rays: PixelRays, paths: int, seed: Sequence[int], stratified: bool = False) -> Array:
         """Mean radiance ``(N, 3)`` of independent paths; another seed gives independent noise.
 
         Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,20 @@ _CHANNELS = 14
 _COLUMNS = 5
 
 Samples = NDArray[np.float32]
+
+
+class _Shot(NamedTuple):
+    """Where the samples of a frame are taken, and what of them is wanted; cameras are as `_lens` has them."""
+
+    camera: list[Any]
+    before: list[Any]
+    moved: Any
+    spp: int
+    color: bool
+    features: bool
+    exact: bool
+    stratified: bool
+    even: bool
 
 
 class TakeTracer:
@@ -133,7 +147,11 @@ class TakeTracer:
         stratified: bool = False,
     ) -> tuple[Samples, Samples, Samples]:
         """Samples ``(H*W, spp, 14)``, and their places in the pixels."""
-        width, height = self.take.size
+        take, (width, height) = self.take, self.take.size
+        now, before = (self._lens(take.cameras[number]) for number in (frame, max(frame - 1, 0)))
+        # Samples that are weighed afterwards lie evenly in the pixel.
+        even = take.splat and not stratified
+        shot = _Shot(now, before, self._movements(frame), spp, color, features, exact, stratified, even)
         values = np.zeros((height, width * spp, _CHANNELS), np.float32)
         places = np.full((2, height, width * spp), 0.5, np.float32)
         rows = height if self._scalar else max(1, min(height, _WAVEFRONT // (width * spp)))
@@ -141,80 +159,50 @@ class TakeTracer:
             count = min(rows, height - top)
             part = slice(top, top + count)
             state = int(np.random.SeedSequence((*seed, top)).generate_state(1)[0])
-            found = self._rows(frame, spp, state, top, count, color, features, exact, stratified)
-            table = found.reshape(-1, count, width * spp)
+            table = self._rows(shot, state, top, count).reshape(-1, count, width * spp)
             values[part], places[:, part] = np.moveaxis(table[:_CHANNELS], 0, -1), table[_CHANNELS:]
         flat = values.reshape(height * width, spp, _CHANNELS)
         return flat, places[0].reshape(height * width, spp), places[1].reshape(height * width, spp)
 
-    def _rows(
-        self,
-        frame: int,
-        spp: int,
-        state: int,
-        top: int,
-        rows: int,
-        color: bool,
-        features: bool,
-        exact: bool,
-        stratified: bool,
-    ) -> NDArray[np.float32]:
+    def _rows(self, shot: _Shot, state: int, top: int, rows: int) -> NDArray[np.float32]:
         """Channels and places ``(16, rows * W * spp)``."""
-        mi, dr, width = self._mi, self._dr, self.take.size[0]
+        mi, dr, width, spp = self._mi, self._dr, self.take.size[0], shot.spp
         count = rows * width * spp
-        kind = {"type": "multijitter", "sample_count": spp} if stratified else {"type": "independent"}
+        kind = {"type": "multijitter", "sample_count": spp} if shot.stratified else {"type": "independent"}
         sampler = mi.load_dict(kind)
-        camera = self._lens(self.take.cameras[frame])
-        before = self._lens(self.take.cameras[max(frame - 1, 0)])
-        moved = self._movements(frame)
-        # Samples that are weighed afterwards lie evenly in the pixel.
-        even = self.take.splat and not stratified
         if self._scalar:
             sampler.seed(state, 1)
             found = []
             for number in range(count):
                 column, row = number // spp % width, number // spp // width + top
-                if stratified and number % spp == 0:
+                if shot.stratified and number % spp == 0:
                     # The strata are those of one pixel.
                     sampler.seed((state + number) % 2**32, 1)
-                sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact, even)
-                found.append([float(value) for value in sample])
+                found.append([float(value) for value in self._sample(shot, sampler, column, row)])
                 sampler.advance()
             return np.nan_to_num(np.array(found, np.float32).T, posinf=0, neginf=0)
-        if stratified:
+        if shot.stratified:
             sampler.set_samples_per_wavefront(spp)
         sampler.seed(dr.opaque(mi.UInt32, state), count)
         pixel = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, spp)
         column, row = pixel % dr.opaque(mi.UInt32, width), pixel // dr.opaque(mi.UInt32, width)
         row += dr.opaque(mi.UInt32, top)
-        sample = self._sample(sampler, column, row, camera, before, moved, color, features, exact, even)
-        used = [value for value in sample if not isinstance(value, int | float)]
-        dr.eval(used)
+        sample = self._sample(shot, sampler, column, row)
+        dr.eval([value for value in sample if not isinstance(value, int | float)])
         table = np.stack([np.broadcast_to(np.array(value, dtype=np.float32), count) for value in sample])
         return np.nan_to_num(table, posinf=0, neginf=0)
 
-    def _sample(
-        self,
-        sampler: Any,
-        column: Any,
-        row: Any,
-        camera: Sequence[Any],
-        before: Sequence[Any],
-        moved: Any,
-        color: bool,
-        features: bool,
-        exact: bool,
-        even: bool,
-    ) -> list[Any]:
+    def _sample(self, shot: _Shot, sampler: Any, column: Any, row: Any) -> list[Any]:
         """The 14 channels of a sample, and its place in the pixel."""
         mi, dr, (width, height) = self._mi, self._dr, self.take.size
         x, y = mi.Float(column) + 0.5, mi.Float(row) + 0.5
         inside = [0.5, 0.5]
         lens = None
-        if not exact:
+        if not shot.exact:
             place, lens = sampler.next_2d(), sampler.next_2d()
-            inside = [place.x, place.y] if even else [self._shift(u) + 0.5 for u in place]
+            inside = [place.x, place.y] if shot.even else [self._shift(u) + 0.5 for u in place]
             x, y = mi.Float(column) + inside[0], mi.Float(row) + inside[1]
+        camera = shot.camera
         left, up, forward, origin, k = camera[:3], camera[3:6], camera[6:9], camera[9:12], camera[12]
         across, down = -(2 * x / width - 1) * k, -(2 * y / height - 1) * (k * (height / width))
         way = [left[i] * across + up[i] * down + forward[i] for i in range(3)]
@@ -225,18 +213,17 @@ class TakeTracer:
             way = [origin[i] + way[i] * self.take.focus - start[i] for i in range(3)]
         ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(*start), dr.normalize(mi.Vector3f(*way))))
         channels: list[Any] = [0.0] * _CHANNELS
-        if color:
+        if shot.color:
             radiance = self._path.sample(self._tracer.scene, sampler, ray)[0]
             sane = dr.all(dr.isfinite(radiance)) & (dr.max(radiance) < _LARGEST)
-            radiance = dr.select(sane, radiance, mi.Color3f(0))
-            channels[:3] = list(radiance)
-        if features:
-            channels[3:] = self._features(ray, camera, before, moved)
-            if color and self.take.void:
+            channels[:3] = list(dr.select(sane, radiance, mi.Color3f(0)))
+        if shot.features:
+            channels[3:] = self._features(ray, shot)
+            if shot.color and self.take.void:
                 channels[:3] = [channel * channels[_HIT] for channel in channels[:3]]
         return [*channels, *inside]
 
-    def _features(self, ray: Any, camera: Sequence[Any], before: Sequence[Any], moved: Any) -> list[Any]:
+    def _features(self, ray: Any, shot: _Shot) -> list[Any]:
         mi, dr = self._mi, self._dr
         scene = self._tracer.scene
         hit = scene.ray_intersect(ray)
@@ -248,7 +235,7 @@ class TakeTracer:
             hit = dr.select(through, scene.ray_intersect(hit.spawn_ray(ray.d), through), hit)
         valid = hit.is_valid()
         if self._scalar and not valid:
-            return [0.0] * 7 + [0.0, *self._motion(ray, hit, False, camera, before, moved), 0.0]
+            return [0.0] * 7 + [0.0, *self._motion(ray, hit, False, shot), 0.0]
         normal = hit.sh_frame.n
         normal = dr.select(valid, dr.select(dr.dot(normal, ray.d) > 0, -normal, normal), mi.Normal3f(0))
         bsdf = hit.bsdf(ray)
@@ -259,28 +246,28 @@ class TakeTracer:
         lamp = valid & (hit.shape.is_emitter())
         albedo = dr.select(lamp, mi.Color3f(1.0 if self.take.white_lamps else 0.0), albedo)
         albedo = dr.select(valid, albedo, mi.Color3f(0))
-        forward, origin = mi.Vector3f(*camera[6:9]), mi.Point3f(*camera[9:12])
+        forward, origin = mi.Vector3f(*shot.camera[6:9]), mi.Point3f(*shot.camera[9:12])
         depth = dr.select(valid, dr.dot(hit.p - origin, forward), 0)
-        motion = self._motion(ray, hit, valid, camera, before, moved)
+        motion = self._motion(ray, hit, valid, shot)
         roughness = dr.select(valid, look[0], 0)
         return [*albedo, *normal, dr.select(valid, mi.Float(1), mi.Float(0)), depth, *motion, roughness]
 
-    def _motion(self, ray: Any, hit: Any, valid: Any, camera: Sequence[Any], before: Sequence[Any], moved: Any) -> Any:
+    def _motion(self, ray: Any, hit: Any, valid: Any, shot: _Shot) -> Any:
         """Way to where the point was in the previous frame, in pixels; what is not hit turns with the camera."""
         mi, dr = self._mi, self._dr
         if self._scalar and not valid:
             now = then = mi.Vector3f(ray.d)
         else:
             earlier = hit.p
-            if moved is not None:
+            if shot.moved is not None:
                 index = self._row(hit)[4]
-                rows = self._moved_rows(moved, index)
+                rows = self._moved_rows(shot.moved, index)
                 x, y, z = hit.p.x, hit.p.y, hit.p.z
                 turned = mi.Point3f(*(m[0] * x + m[1] * y + m[2] * z + m[3] for m in rows))
                 earlier = dr.select(index >= 0, turned, earlier)
-            now = dr.select(valid, hit.p - mi.Point3f(*camera[9:12]), mi.Vector3f(ray.d))
-            then = dr.select(valid, earlier - mi.Point3f(*before[9:12]), mi.Vector3f(ray.d))
-        start, end = self._raster(now, camera), self._raster(then, before)
+            now = dr.select(valid, hit.p - mi.Point3f(*shot.camera[9:12]), mi.Vector3f(ray.d))
+            then = dr.select(valid, earlier - mi.Point3f(*shot.before[9:12]), mi.Vector3f(ray.d))
+        start, end = self._raster(now, shot.camera), self._raster(then, shot.before)
         return [end[0] - start[0], end[1] - start[1]]
 
     def _raster(self, way: Any, camera: Sequence[Any]) -> tuple[Any, Any]:
