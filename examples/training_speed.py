@@ -29,13 +29,13 @@ from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, Precision, create_model
 from mcdenoise.train import TrainConfig
-from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import check_config
 from mcdenoise.train.data import DataFolders
 from mcdenoise.train.devices import open_fabric
-from mcdenoise.train.front import ACCUMULATED, split
+from mcdenoise.train.front import split
 from mcdenoise.train.loop import Trainer
+from mcdenoise.train.shots import Shot
 
 WARM_UP = 2
 
@@ -47,9 +47,9 @@ def noise(config: TrainConfig) -> ClipSampler:
     def uniform(channels: int) -> NDArray[np.float32]:
         return generator.random((config.frames, channels, config.crop, config.crop), np.float32)
 
-    noisy = np.concatenate([uniform(ACCUMULATED["color"] + ACCUMULATED["current"]), np.ceil(8 * uniform(1)).clip(1)], 1)
-    features = {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
-    return ClipSampler([CachedShot((noisy,), features, demodulated=True)], config.frames, config.crop)
+    shot = {"color": uniform(3), "current": uniform(3), "length": np.ceil(8 * uniform(1)).clip(1)}
+    shot |= {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
+    return ClipSampler([Shot.of(shot, demodulated=True)], config.frames, config.crop)
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:

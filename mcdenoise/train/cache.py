@@ -12,14 +12,15 @@ from __future__ import annotations
 import fcntl
 import functools
 import hashlib
+import itertools
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -30,74 +31,17 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models._motion import motion_to_previous
-from mcdenoise.train.front import ACCUMULATED, Front
+from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Array, Shot
 
 _CAMERA = frozenset({"position", "view_projection"})
 # Patterns of the files of a sequence, relative to its folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "noise_seed*/*", "inputs/*", "inputs/noise_seed*/*")
-_FORMAT = 5
+_FORMAT = 6
 
 # Index of the first frame, and noise seed: each pair has its own colors.
 _Start: TypeAlias = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class CachedShot(Shot):
-    """Consecutive frames as the network's input, for one or more noise seeds.
-
-    Args:
-        colors: for each noise seed ``(T, C, H, W)``: its channels, as ``parts`` describes them.
-        features: ``(T, C, H, W)`` all other buffers by name; ``view_projection`` is ``(T, 4, 4)``.
-        demodulated: whether the radiance in ``colors`` is demodulated.
-        noisy: for each noise seed the features that depend on it, in the same form; empty if there are none.
-        parts: names and channels of the buffers in ``colors``; these may hold only the first of them. By default
-            accumulated radiance, radiance of the current frame, and history length.
-    """
-
-    colors: tuple[Array, ...]
-    features: Mapping[str, Array]
-    demodulated: bool = False
-    noisy: tuple[Mapping[str, Array], ...] = ()
-    parts: Mapping[str, int] = field(default_factory=lambda: ACCUMULATED)
-
-    def __len__(self) -> int:
-        return len(self.colors[0])
-
-    @property
-    def noise_seeds(self) -> int:
-        """Number of noisy colors of a frame."""
-        return len(self.colors)
-
-    @property
-    def references(self) -> int:
-        """Number of the last frames that have a reference: all."""
-        return len(self)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-        height, width = self.colors[0].shape[-2:]
-        return int(height), int(width)
-
-    def cut(self, frames: slice) -> CachedShot:
-        """Select consecutive frames; their history is kept."""
-        features = {name: feature[frames] for name, feature in self.features.items()}
-        noisy = tuple({name: feature[frames] for name, feature in own.items()} for own in self.noisy)
-        return CachedShot(tuple(color[frames] for color in self.colors), features, self.demodulated, noisy, self.parts)
-
-    def views(self, frames: slice, rows: slice, columns: slice, noise_seed: int) -> dict[str, Array]:
-        """See :meth:`mcdenoise.train.shots.Shot.views`."""
-        color, found, start = self.colors[noise_seed], dict[str, Array](), 0
-        for name, count in self.parts.items():
-            if start < color.shape[1]:
-                found[name] = color[:, start : start + count]
-            start += count
-        found |= {**self.features, **(self.noisy[noise_seed] if self.noisy else {})}
-        return {
-            name: array[frames] if array.ndim == 3 else array[frames, :, rows, columns] for name, array in found.items()
-        }
 
 
 @dataclass(frozen=True)
@@ -109,7 +53,7 @@ class CachedSequence:
         sha256: checksum of all decoded noisy colors and references, as bytes of float32.
     """
 
-    shots: list[CachedShot]
+    shots: list[Shot]
     sha256: str
 
 
@@ -122,31 +66,23 @@ class _Plan:
     features: tuple[str, ...]
     firsts: tuple[int, ...]
     noise_seeds: int
-    keep_fireflies: int
 
     @property
-    def own(self) -> tuple[str, ...]:
+    def own(self) -> frozenset[str]:
         """Features that depend on the noise seed."""
         noisy = self.sequence.noisy
         # Depth and motion may be computed from the positions.
         derived = {"motion"} if "position" in noisy and "motion" not in self.sequence.buffers else set()
-        return tuple(name for name in self.features if name in noisy | derived)
+        return (noisy | derived) & set(self.features)
 
     @property
-    def shared(self) -> tuple[str, ...]:
-        """Features that are the same for all noise seeds."""
-        return tuple(name for name in self.features if name not in self.own)
+    def stored(self) -> list[tuple[str, int]]:
+        """Each feature with the noise seeds that it is stored for; the first, if it is the same for all."""
+        return [(name, k) for name in self.features for k in range(self.noise_seeds if name in self.own else 1)]
 
     @property
     def starts(self) -> list[_Start]:
         return [(first, noise_seed) for first in self.firsts for noise_seed in range(self.noise_seeds)]
-
-    def begin(self, noise_seed: int) -> Callable[[Frame], Frame]:
-        kept = self.keep_fireflies > 0 and (noise_seed + 1) % self.keep_fireflies == 0
-        return self.front.begin(keep_fireflies=kept)
-
-    def color_shape(self, first: int) -> tuple[int, ...]:
-        return (len(self.sequence) - first, sum(self.front.parts.values()), *self.sequence.size)
 
 
 def features_of(sequence: Sequence) -> frozenset[str]:
@@ -163,7 +99,6 @@ def open_cached(
     features: Iterable[str],
     firsts: list[int],
     noise_seeds: int | None = None,
-    keep_fireflies: int = 0,
 ) -> CachedSequence:
     """Open a sequence as the network's input from a cache, and fill the cache if necessary.
 
@@ -183,7 +118,6 @@ def open_cached(
         features: names of further buffers to store, see :func:`features_of`.
         firsts: indices of the first frames, ascending.
         noise_seeds: number of noise seeds to use; all by default.
-        keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics; 0 for none.
 
     Raises:
         InputError: a buffer or a reference is missing or damaged, or the cache cannot be written; then no incomplete
@@ -191,10 +125,10 @@ def open_cached(
     """
     found = sequence.noise_seeds if noise_seeds is None else min(noise_seeds, sequence.noise_seeds)
     kept = tuple(sorted({*features, "reference"}))
-    plan = _Plan(sequence, front, kept, tuple(firsts), found, keep_fireflies)
+    plan = _Plan(sequence, front, kept, tuple(firsts), found)
     # The id does not include the number of noise seeds found, so that arrays of fewer seeds are found stale and
     # removed.
-    settings = [sequence.numbers, front.settings, kept, firsts, noise_seeds, keep_fireflies]
+    settings = [sequence.numbers, front.settings, kept, firsts, noise_seeds]
     identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     finished = place / _key(sequence.root, [_FORMAT, *settings, found])[:32]
@@ -270,36 +204,36 @@ def _fill(finished: Path, plan: _Plan) -> None:
 
 def _build(folder: Path, plan: _Plan) -> None:
     """Decode the frames one after the other; only features without noise are collected in memory."""
-    sequence = plan.sequence
-    steps = {start: plan.begin(start[1]) for start in plan.starts}
-    features: dict[str, list[Array]] = {_feature_name(name): [] for name in plan.shared}
-    features |= {_feature_name(name, k): [] for name in plan.own for k in range(plan.noise_seeds)}
+    sequence, digest = plan.sequence, hashlib.sha256()
+    steps = {start: plan.front.begin() for start in plan.starts}
+    features: dict[tuple[str, int], list[Array]] = {each: [] for each in plan.stored}
+    channels = sum(plan.front.parts.values())
     camera: Tensor | None = None
-    digest = hashlib.sha256()
     with ExitStack() as stack:
-        files = {
-            start: stack.enter_context(_array_file(folder / _color_name(start), plan.color_shape(start[0])))
-            for start in plan.starts
-        }
+        files = {}
+        for start in plan.starts:
+            # A stream instead of a memory map, because writing to a map kills the process when the disk is full.
+            files[start] = stack.enter_context((folder / _file("color", *start)).open("wb"))
+            shape = len(sequence) - start[0], channels, *sequence.size
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(files[start], header)
         wanted = {*plan.features, *plan.front.parts}
         for i, number in enumerate(sequence.numbers):
             for noise_seed in range(plan.noise_seeds):
                 frame = _read(sequence, number, noise_seed, wanted, digest)
-                for first in plan.firsts:
-                    if first <= i:
-                        seen = dict(steps[first, noise_seed](frame).items())
-                        noisy = torch.cat([seen[name] for name in plan.front.parts], 1)
-                        files[first, noise_seed].write(noisy.numpy().tobytes())
+                for start, step in steps.items():
+                    if start[0] <= i and start[1] == noise_seed:
+                        seen = dict(step(frame).items())
+                        files[start].write(torch.cat([seen[name] for name in plan.front.parts], 1).numpy().tobytes())
                 if noise_seed == 0 or plan.own:
                     found = dict((_with_motion(frame, camera) if "motion" in plan.features else frame).items())
-                    for name in plan.shared if noise_seed == 0 else ():
-                        features[_feature_name(name)].append(_smallest(found[name].numpy()))
-                    for name in plan.own:
-                        features[_feature_name(name, noise_seed)].append(_smallest(found[name].numpy()))
+                    for name, own in features:
+                        if own == noise_seed:
+                            features[name, own].append(_smallest(found[name].numpy()))
             camera = frame.view_projection
-    for file in list(features):
+    for each in list(features):
         # If half precision is not exact for one frame, all frames are stored in single precision.
-        np.save(folder / file, np.concatenate(features.pop(file)), allow_pickle=False)
+        np.save(folder / _file(*each), np.concatenate(features.pop(each)), allow_pickle=False)
     checksums = {path.name: _checksum(path) for path in sorted(folder.iterdir())}
     (folder / "about.json").write_text(json.dumps({"sha256": digest.hexdigest(), "files": checksums}) + "\n")
 
@@ -324,18 +258,6 @@ def _with_motion(frame: Frame, camera: Tensor | None) -> Frame:
     return frame.replace(motion=torch.full_like(frame.color[:, :2], torch.inf) if motion is None else motion)
 
 
-@contextmanager
-def _array_file(path: Path, shape: tuple[int, ...]) -> Iterator[BinaryIO]:
-    """Write the header of a ``.npy`` file of little-endian float32; the values are to be appended in order.
-
-    A stream is used instead of a memory map because writing to a map kills the process when the disk is full.
-    """
-    with path.open("wb") as file:
-        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        yield file
-
-
 def _smallest(values: Array) -> Array:
     """Convert to half precision if that is exact."""
     with np.errstate(over="ignore"):
@@ -343,13 +265,8 @@ def _smallest(values: Array) -> Array:
     return half if np.array_equal(half.astype(values.dtype), values) else values
 
 
-def _color_name(start: _Start) -> str:
-    first, noise_seed = start
-    return f"color-{first}-{noise_seed}.npy"
-
-
-def _feature_name(name: str, noise_seed: int | None = None) -> str:
-    return f"{name}.npy" if noise_seed is None else f"{name}-{noise_seed}.npy"
+def _file(name: str, *numbers: int) -> str:
+    return f"{'-'.join([name, *map(str, numbers)])}.npy"
 
 
 def _checksum(path: Path) -> str:
@@ -363,17 +280,16 @@ def _load(folder: Path, plan: _Plan) -> CachedSequence | None:
         about = json.loads((folder / "about.json").read_text())
         if any(_checksum(folder / name) != checksum for name, checksum in about["files"].items()):
             return None
-        features = {name: _map(folder / _feature_name(name)) for name in plan.shared}
-        noisy = [
-            {name: _map(folder / _feature_name(name, k)) for name in plan.own}
-            for k in range(plan.noise_seeds if plan.own else 0)
-        ]
+        features = {each: _map(folder / _file(*each)) for each in plan.stored}
+        ends = list(itertools.accumulate(plan.front.parts.values()))[:-1]
         shots = []
         for first in plan.firsts:
-            colors = [_map(folder / _color_name((first, k))) for k in range(plan.noise_seeds)]
-            later = {name: feature[first:] for name, feature in features.items()}
-            own = tuple({name: feature[first:] for name, feature in each.items()} for each in noisy)
-            shots.append(CachedShot(tuple(colors), later, plan.front.demodulates, own, plan.front.parts))
+            arrays = []
+            for k in range(plan.noise_seeds):
+                noisy = np.split(_map(folder / _file("color", first, k)), ends, 1)
+                own = {name: features[name, k if name in plan.own else 0][first:] for name in plan.features}
+                arrays.append(dict(zip(plan.front.parts, noisy, strict=True)) | own)
+            shots.append(Shot.of(*arrays, demodulated=plan.front.demodulates))
         return CachedSequence(shots, str(about["sha256"]))
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -15,7 +15,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Frame, Hints
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
-from mcdenoise.ops import NO_ALBEDO, demodulate
+from mcdenoise.ops import demodulate
 from mcdenoise.train.shots import Array, Shot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
@@ -102,9 +102,6 @@ class ClipSampler:
             not scale.
         exposure: the light of a clip is scaled by up to this many stops, up or down.
         tint: each color channel of the light is scaled by up to this many stops, up or down.
-        gloss: probability that surfaces without albedo (mirrors, glass, black gloss, and lamps) are darkened by up to
-            six stops: most of these are emitters, and without this a network would learn to treat a black screen as
-            one.
 
     Raises:
         InputError: no shot is long enough, or one is smaller than the crop.
@@ -120,11 +117,10 @@ class ClipSampler:
         key: float = 0.0,
         exposure: float = 0.0,
         tint: float = 0.0,
-        gloss: float = 0.0,
     ) -> None:
         self.shots = [shot for shot in shots if _is_enough(len(shot), frames)]
         self.frames, self.crop = frames, crop
-        self.lamps, self.key, self.exposure, self.tint, self.gloss = lamps, key, exposure, tint, gloss
+        self.lamps, self.key, self.exposure, self.tint = lamps, key, exposure, tint
         check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(max(len(shot), frames)) for shot in self.shots])
 
@@ -171,10 +167,6 @@ class ClipSampler:
         if self.key:
             factor = factor * auto_exposure(clip["reference"][:1], self.key)[0]
         _light(clip, factor)
-        if self.gloss and float(torch.rand(())) < self.gloss:
-            # Darken the light towards the camera; the effect on other surfaces is neglected.
-            glossy = clip["albedo"].amax(1, keepdim=True) < NO_ALBEDO
-            _light(clip, torch.where(glossy, torch.exp2(-6 * torch.rand(())), 1))
         if self.lamps and float(torch.rand(())) < self.lamps:
             mean = clip["reference"].mean()
             for _ in range(1 + _randint(3)):
@@ -258,8 +250,7 @@ def _cropped(view: Tensor, size: tuple[int, int], corner: tuple[int, int], crop:
 def _light(clip: dict[str, Tensor], factor: Tensor) -> None:
     """Scale all light of a clip."""
     for name in LIGHT & clip.keys():
-        # The reference may have only the last frames.
-        clip[name] *= factor if factor.dim() == 3 else factor[-len(clip[name]) :]
+        clip[name] *= factor
     if "variance" in clip:
         clip["variance"] *= factor.square()
 

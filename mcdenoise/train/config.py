@@ -6,7 +6,10 @@ import dataclasses
 import json
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeAlias
+
+import msgspec
+from msgspec import Meta
 
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT, Precision
@@ -15,6 +18,9 @@ from mcdenoise.train.losses import Loss
 Schedule = Literal["constant", "cosine"]
 
 _WARM_UP = 200
+_Count: TypeAlias = Annotated[int, Meta(ge=1)]
+_Weight: TypeAlias = Annotated[float, Meta(ge=0)]
+_Stops: TypeAlias = Annotated[float, Meta(ge=0, le=14)]
 
 
 @dataclass(frozen=True)
@@ -27,8 +33,6 @@ class TrainConfig:
     Args:
         model: a name in the zoo, or your own path/to/file.py:factory or package.module:factory.
         settings: arguments of the model's constructor, such as width=16,cascade=K+P.
-        width: feature channels, the same as in the settings; 0 takes the model's default, or that of the initial
-            weights.
         start_from: a model with weights, which the layers of the same names start with, such as cascaded_v2 or
             oidn_open(quality=fast); all by default start with random weights.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
@@ -53,49 +57,40 @@ class TrainConfig:
             in every step, the low frequencies of a larger one would never be trained and drift, since those of the
             smaller one replace them.
         start_every: a shot of a model that accumulates also begins at every n-th frame, to train on short histories.
-        keep_fireflies: every n-th noise seed keeps its fireflies as if they were caustics, see
-            Accumulated; 0 for none.
         validation_frames: number of frames at the end of each sequence that are kept for validation (the paper's 4); 0
             for a sequence with less than one clip left.
         lamps: probability that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the
             rest.
         exposure: the light of a clip is scaled by up to this many stops.
         tint: each color channel of the light is scaled by up to this many stops.
-        gloss: probability that surfaces without albedo (mirrors, glass, lamps) are darkened by up to six stops.
-        exact_features: train and validate on sequences with exact features only, see
-            has_exact_features; the others are skipped.
         precision: bfloat16 runs convolutions in bfloat16.
         seed: seed of weights and clips.
     """
 
     model: str = DEFAULT
     settings: str = ""
-    width: int = 0
     start_from: str = ""
     losses: str = ""
     loss: Loss = "smape"
-    steps: int = 10_000
-    batch: int = 8
-    frames: int = 8
-    crop: int = 128
-    learning_rate: float = 1e-4
+    steps: _Count = 10_000
+    batch: _Count = 8
+    frames: _Count = 8
+    crop: _Count = 128
+    learning_rate: Annotated[float, Meta(gt=0)] = 1e-4
     schedule: Schedule = "constant"
-    temporal_weight: float = 0.1
-    display_weight: float = 0.0
-    key: float = 0.0
-    gradient_norm: float = 0.0
-    ema: float = 0.0
+    temporal_weight: _Weight = 0.1
+    display_weight: _Weight = 0.0
+    key: _Weight = 0.0
+    gradient_norm: _Weight = 0.0
+    ema: Annotated[float, Meta(ge=0, lt=1)] = 0.0
     draw_resolutions: bool = True
-    start_every: int = 4
-    keep_fireflies: int = 0
-    validation_frames: int = 4
-    lamps: float = 0.0
-    exposure: float = 0.0
-    tint: float = 0.0
-    gloss: float = 0.0
-    exact_features: bool = False
+    start_every: _Count = 4
+    validation_frames: Annotated[int, Meta(ge=0)] = 4
+    lamps: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    exposure: _Stops = 0.0
+    tint: _Stops = 0.0
     precision: Precision = "float32"
-    seed: int = 0
+    seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
 
     @property
     def model_settings(self) -> dict[str, Any]:
@@ -104,7 +99,7 @@ class TrainConfig:
         Raises:
             InputError: the settings have another form.
         """
-        return parse_settings("settings", self.settings) | ({"width": self.width} if self.width else {})
+        return parse_settings("settings", self.settings)
 
     @property
     def loss_weights(self) -> dict[str, float]:
@@ -133,42 +128,17 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     Raises:
         InputError: a setting is invalid; the message names it.
     """
-    lowest = {
-        "width": 0,
-        "steps": 1,
-        "batch": 1,
-        "frames": 2 if config.temporal_weight else 1,
-        # A lamp is two pixels wide, and needs more than one possible position.
-        "crop": 3 if config.lamps else 1,
-        "temporal_weight": 0,
-        "display_weight": 0,
-        "key": 0,
-        "gradient_norm": 0,
-        "start_every": 1,
-        "keep_fireflies": 0,
-        "validation_frames": 0,
-        "checkpoint_every": 1,
-    }
-    settings = {**dataclasses.asdict(config), "checkpoint_every": checkpoint_every}
-    for name, low in lowest.items():
-        if not settings[name] >= low:
-            raise InputError(f"{name}: expected at least {low}, found {settings[name]}")
-    choices = {"loss": get_args(Loss), "schedule": get_args(Schedule), "precision": get_args(Precision)}
-    for name, known in choices.items():
-        if settings[name] not in known:
-            raise InputError(f"{name}: expected one of {', '.join(known)}, found '{settings[name]}'")
-    for name in ("exposure", "tint"):
-        if not 0 <= settings[name] <= 14:
-            raise InputError(f"{name}: expected 0 to 14 stops, found {settings[name]}")
-    if not 0 <= config.seed < 2**32:
-        raise InputError(f"seed: expected 0 to 2^32 - 1, found {config.seed}")
-    if not config.learning_rate > 0:
-        raise InputError(f"learning_rate: expected a positive number, found {config.learning_rate}")
-    if not 0 <= config.ema < 1:
-        raise InputError(f"ema: expected in [0, 1), found {config.ema}")
-    for name in ("lamps", "gloss"):
-        if not 0 <= settings[name] <= 1:
-            raise InputError(f"{name}: expected in [0, 1], found {settings[name]}")
+    try:
+        msgspec.convert(dataclasses.asdict(config), TrainConfig)
+    except msgspec.ValidationError as error:
+        what, _, name = str(error).replace("`", "").rpartition(" - at $.")
+        raise InputError(f"{name}: {what[0].lower()}{what[1:]}, found {getattr(config, name)}") from error
+    # A lamp is two pixels wide, and needs more than one possible position.
+    for name, low in {"frames": 2 if config.temporal_weight else 1, "crop": 3 if config.lamps else 1}.items():
+        if getattr(config, name) < low:
+            raise InputError(f"{name}: expected at least {low}, found {getattr(config, name)}")
+    if checkpoint_every < 1:
+        raise InputError(f"checkpoint_every: expected at least 1, found {checkpoint_every}")
     _ = config.model_settings, config.loss_weights
 
 

@@ -11,7 +11,6 @@ from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.shards import Shard, find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
-from mcdenoise.sampling import has_exact_features
 from mcdenoise.train.cache import features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
@@ -75,29 +74,17 @@ class DataFolders:
 
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
-                frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, or
-                none has exact features although they are required.
+                frames are missing within a sequence, no sequence is long enough, or one is smaller than the crop.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
         packed = [open_packed(paths) for paths in (training, validation)]
         opened = [[open_sequence(path) for path in paths if not find_shards(path)] for paths in (training, validation)]
-        if config.exact_features:
-            opened = [[sequence for sequence in each if _is_exact(sequence)] for each in opened]
-            packed = [[shard for shard in each if shard.header.get("features") == "exact"] for each in packed]
-            if not opened[0] and not packed[0]:
-                raise InputError(
-                    "exact_features: expected a sequence with features without noise to train on, found none among "
-                    f"{len(training)}; render one with mcdenoise generate"
-                )
-        both = [*opened[0], *opened[1]]
-        # Surfaces without albedo are glossy.
-        takes = [*packed[0], *packed[1]]
+        both, takes = [*opened[0], *opened[1]], [*packed[0], *packed[1]]
         common = frozenset.intersection(*map(features_of, both), *map(features_of_shard, takes))
         front = front.of((needs.buffers | needs.uses) & common)
-        used = (needs.buffers | needs.uses | ({"albedo"} if config.gloss else set())) - front.parts.keys()
         # The cache does not store single samples: methods that take samples are trained on their mean.
-        used -= {"samples"}
+        used = (needs.buffers | needs.uses) - front.parts.keys() - {"samples"}
         wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
         for sequence in both:
             _check_trainable(sequence, wanted)
@@ -127,19 +114,12 @@ class DataFolders:
             firsts = range(0, len(sequence), config.start_every if self.front.accumulates else len(sequence))
             # Skip a shot without room for a clip, except the first one, which carries the checksum.
             useful = [first for first in firsts if first == 0 or length - first >= config.frames]
-            cached = open_cached(
-                sequence,
-                cache,
-                front=self.front,
-                features=self.features,
-                firsts=useful,
-                keep_fireflies=config.keep_fireflies,
-            )
+            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=useful)
             shots += [shot.cut(slice(length - first)) for first, shot in zip(useful, cached.shots, strict=True)]
             if held:
                 watched.append((sequence.name, cached.shots[0].cut(slice(length, None))))
-            noise_seeds = len(cached.shots[0].colors)
-            entries.append(_describe(sequence, cached.sha256, noise_seeds=noise_seeds, validation=held))
+            about = {"noise_seeds": cached.shots[0].noise_seeds, "validation": held}
+            entries.append(_describe(sequence, cached.sha256, **about))
         description: dict[str, Any] = {"sequences": entries}
         if self.packed:
             description["packed"] = describe_packed(self.packed)
@@ -150,27 +130,14 @@ class DataFolders:
         watched += [(each.path.name, shot) for each in self.packed_validation for shot in shots_of(each, *handed)]
         if self.packed_validation:
             description["packed_validation"] = describe_packed(self.packed_validation)
-        sampler = ClipSampler(
-            shots,
-            config.frames,
-            config.crop,
-            lamps=config.lamps,
-            key=config.key,
-            exposure=config.exposure,
-            tint=config.tint,
-            gloss=config.gloss,
-        )
+        light = {"key": config.key, "exposure": config.exposure, "tint": config.tint}
+        sampler = ClipSampler(shots, config.frames, config.crop, lamps=config.lamps, **light)
         return TrainingData(sampler, watched, description)
 
     def _held_out(self, sequence: Sequence) -> list[int]:
         """Numbers of the last frames, kept for validation; none if too few frames would remain."""
         enough = len(sequence) >= self.config.frames + self.config.validation_frames
         return sequence.numbers[len(sequence) - self.config.validation_frames :] if enough else []
-
-
-def _is_exact(sequence: Sequence) -> bool:
-    """Whether the features of the first frame are exact."""
-    return has_exact_features(sequence.frame(sequence.numbers[0], reference=False, buffers={"normal", "depth"}))
 
 
 def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:

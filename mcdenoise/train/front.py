@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Clamped, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
-from mcdenoise.models.accumulated import CAUSTICS
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
@@ -61,17 +60,12 @@ class Front:
     def _has(self, wanted: type[Wrapper]) -> bool:
         return any(kind is wanted for kind, _ in self.wrappers)
 
-    def begin(self, *, keep_fireflies: bool = False) -> Callable[[Frame], Frame]:
-        """Return a function that processes the frames of one shot, in order, as input of the rest of the model.
-
-        Args:
-            keep_fireflies: treat fireflies as caustics in every shot.
-        """
+    def begin(self) -> Callable[[Frame], Frame]:
+        """Return a function that processes the frames of one shot, in order, as input of the rest of the model."""
         seen = _Seen()
         model: Model = seen
         for kind, settings in reversed(self.wrappers):
-            caustics = {"firefly_limit": CAUSTICS} if keep_fireflies and kind is Accumulated else {}
-            model = kind(model, **{**settings, **caustics})
+            model = kind(model, **settings)
         state: State = None
 
         def step(frame: Frame) -> Frame:

@@ -121,8 +121,6 @@ def train(
     torch.manual_seed(config.seed)
     network, settings, start = _begun(config, initial_weights)
     front, rest = split(network)
-    if config.keep_fireflies and not front.accumulates:
-        raise InputError("keep_fireflies: expected a model that begins with Accumulated, found another")
     folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
 
     run, settled = RunFolder(out), dataclasses.asdict(config)

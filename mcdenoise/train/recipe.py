@@ -18,13 +18,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import GenericAlias
+from typing import Annotated, Any, Literal, get_type_hints
+
+import msgspec
+from msgspec import UNSET, Meta
 
 from mcdenoise.data.files import write_text
 from mcdenoise.data.shards import find_shards
@@ -36,18 +39,14 @@ from mcdenoise.train.cache import locked
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.references import clean_references
 
-_TABLES = ("train", "data", "validation", "expected", "run")
-_BOUND = {"smape": float, "tolerance": float}
 _CLEAN = "clean_references"
-# Keys of a table of data that are no options of `mcdenoise generate`.
-_OWN: dict[str, type] = {_CLEAN: bool, "folder": str}
 # A run's name is also the name of its folder.
-_NAME = re.compile(r"[A-Za-z0-9+_-]{1,64}")
+_Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9+_-]{1,64}$")]
+# Keys of a table of data that are no options of `mcdenoise generate`.
+_OWN = {"folder": _Name, _CLEAN: bool}
 _NO_PIXELS = ("workers", "threads")
 # A file names neither a program to run, nor a machine to connect to, nor a place outside of the data.
 _OF_CALLERS = {"workers", "assets"}
-# But a recipe may do without assets.
-_WITHOUT = ("assets", "none")
 # Sequences had other scenes before, which are not those of the same options now.
 _SCENES = 2
 # Checksums use the first name of an option, so that those in headers of older weights still match their recipes.
@@ -156,16 +155,13 @@ class Recipe:
         Raises:
             InputError: the file cannot be read, a key is unknown, or a value is invalid.
         """
-        content = _parse(path)
-        kinds = {field.name: type(field.default) for field in fields(TrainConfig)}
-        common = _checked(f"{path}: [train]", content.get("train", {}), {**kinds, "credits": str})
-        made = {name: _renderings(path, name, content.get(name, []), options) for name in ("data", "validation")}
-        if not made["data"]:
-            raise InputError(f"{path}: expected at least one table [[data]] to render and train on, found none")
+        content = _parsed(path, options)
+        common = content.get("train", {})
+        made = {name: _renderings(path, name, content.get(name, [])) for name in ("data", "validation")}
         rendered = [[(r.sha256, r.clean) for r in each] for each in made.values()]
         runs = []
-        for where, own in _run_tables(path, content, kinds):
-            name, expected = own.pop("name", ""), _expected(where, own.pop("expected", {}))
+        for where, own in _run_tables(path, content):
+            name, bound = own.pop("name", ""), own.pop("expected", None)
             settings = common | own
             sha256 = _digest([settings or None, *rendered])
             config = TrainConfig(**{key: value for key, value in settings.items() if key != "credits"})
@@ -175,6 +171,7 @@ class Recipe:
                 # Check settings before hours of rendering.
                 check_config(config, 1)
                 create_model(config.model, **config.model_settings)
+            expected = (float(bound["smape"]), float(bound["tolerance"])) if bound else None
             runs.append(Run(name, config, expected, sha256))
         if any(rendering.clean for each in made.values() for rendering in each):
             with naming(str(path)):
@@ -195,37 +192,21 @@ class Recipe:
         return [run for run in self.runs if not names or run.name in names]
 
 
-def _run_tables(path: Path, content: dict[str, Any], kinds: Mapping[str, type]) -> list[tuple[str, dict[str, Any]]]:
+def _run_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """The location of each run in the recipe, and its settings that differ from the common ones."""
-    tables = content.get("run", [])
-    if not isinstance(tables, list):
-        raise InputError(f"{path}: expected tables [[run]], found [run]")
-    if not tables:
-        return [(str(path), {"expected": content.get("expected", {})})]
+    if not content.get("run"):
+        return [(str(path), {"expected": content.get("expected")})]
     if "expected" in content:
         raise InputError(f"{path}: expected what is expected in each [[run]], found [expected]")
-    found: list[tuple[str, dict[str, Any]]] = []
-    for number, table in enumerate(tables, start=1):
-        where = f"{path}: [[run]] {number}"
-        own = _checked(where, table, {**kinds, "name": str, "expected": dict, "seeds": list})
-        name, seeds = own.get("name", ""), own.pop("seeds", None)
-        if seeds is not None and not (seeds and all(type(seed) is int for seed in seeds)):
-            raise InputError(f"{where}: seeds: expected a list of whole numbers, found {seeds}")
-        every = [own] if seeds is None else [{**own, "name": f"{name}-{each}", "seed": each} for each in seeds]
-        if not _NAME.fullmatch(name):
-            raise InputError(f"{where}: name: expected letters, digits, '+', '-' and '_', found '{name}'")
+    found: dict[str, tuple[str, dict[str, Any]]] = {}
+    for number, table in enumerate(content["run"], start=1):
+        where, own = f"{path}: [[run]] {number}", {key: value for key, value in table.items() if key != "seeds"}
+        every = [{**own, "name": f"{own['name']}-{seed}", "seed": seed} for seed in table.get("seeds", [])] or [own]
         for each in every:
-            if each["name"] in (other["name"] for _, other in found):
+            if each["name"] in found:
                 raise InputError(f"{where}: name: expected each name once, found '{each['name']}' again")
-            found.append((where, each))
-    return found
-
-
-def _expected(where: str, table: Any) -> tuple[float, float] | None:
-    expected = _checked(f"{where}: [expected]", table, _BOUND)
-    if expected and expected.keys() != _BOUND.keys():
-        raise InputError(f"{where}: [expected]: expected smape and tolerance, found {', '.join(expected)} alone")
-    return (float(expected["smape"]), float(expected["tolerance"])) if expected else None
+            found[each["name"]] = where, each
+    return list(found.values())
 
 
 @contextmanager
@@ -237,49 +218,50 @@ def naming(where: str) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from error
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def _parsed(path: Path, options: Collection[str]) -> dict[str, Any]:
+    """The tables of a recipe, with known keys and values of the right types only."""
+    settings = [(name, kind, UNSET) for name, kind in get_type_hints(TrainConfig, include_extras=True).items()]
+    expected = _table({"smape": float, "tolerance": float})
+    run = _table({"name": _Name}, *settings, ("expected", expected, UNSET), ("seeds", _some(int), UNSET))
+    # A recipe may do without assets.
+    chosen = dict.fromkeys({*options} - _OF_CALLERS, Any) | {"assets": Literal["none"]} | _OWN
+    data = _table({}, *((name, kind, UNSET) for name, kind in chosen.items()))
+    file = _table(
+        {"data": _some(data)},
+        ("train", _table({}, *settings, ("credits", str, UNSET)), UNSET),
+        ("validation", _some(data, 0), UNSET),
+        ("expected", expected, UNSET),
+        ("run", _some(run, 0), UNSET),
+    )
     try:
         content = tomllib.loads(read_text(path))
+        msgspec.convert(content, file)
     except OSError as error:
         raise InputError(f"{path}: expected a recipe, found no file that can be read ({error.strerror})") from error
+    except msgspec.ValidationError as error:
+        what, _, place = str(error).replace("`", "").partition(" - at $.")
+        raise InputError(f"{path}: {f'{place}: ' if place else ''}{what[0].lower()}{what[1:]}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected a recipe in TOML, found: {error}") from error
-    _check_keys(str(path), content, _TABLES)
     return content
 
 
-def _renderings(path: Path, name: str, tables: Any, options: Collection[str]) -> list[Rendering]:
-    if not isinstance(tables, list):
-        raise InputError(f"{path}: expected tables [[{name}]], found [{name}]")
+def _table(required: Mapping[str, Any], *optional: tuple[str, Any, Any]) -> Any:
+    return msgspec.defstruct("Table", [*required.items(), *optional], forbid_unknown_fields=True)
+
+
+def _some(kind: Any, least: int = 1) -> Any:
+    """The type of a list with as many elements at least."""
+    return Annotated.__class_getitem__((GenericAlias(list, kind), Meta(min_length=least)))  # type: ignore[attr-defined]
+
+
+def _renderings(path: Path, name: str, tables: list[dict[str, Any]]) -> list[Rendering]:
     made = []
     for number, table in enumerate(tables, start=1):
-        where = f"{path}: [[{name}]] {number}"
-        own = dict([item for item in table.items() if item != _WITHOUT]) if isinstance(table, dict) else table
-        _check_keys(where, own, {*options, *_OWN} - _OF_CALLERS)
-        own = _checked(where, {key: table[key] for key in _OWN.keys() & table.keys()}, _OWN)
-        name = own.get("folder", "")
-        if name and not _NAME.fullmatch(name):
-            raise InputError(f"{where}: folder: expected letters, digits, '+', '-' and '_', found '{name}'")
-        rest = {key: value for key, value in table.items() if key not in _OWN}
-        made.append(Rendering(where, rest, own.get(_CLEAN, False), name))
+        options = {key: value for key, value in table.items() if key not in _OWN}
+        about = table.get(_CLEAN, False), table.get("folder", "")
+        made.append(Rendering(f"{path}: [[{name}]] {number}", options, *about))
     return made
-
-
-def _checked(where: str, table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """Check the keys and the types of the values of a table."""
-    _check_keys(where, table, kinds)
-    for key, value in table.items():
-        if type(value) is not kinds[key] and (type(value), kinds[key]) != (int, float):
-            raise InputError(f"{where}: {key}: expected a value of type {kinds[key].__name__}, found {value!r}")
-    return dict(table)
-
-
-def _check_keys(where: str, table: Any, known: Collection[str]) -> None:
-    if not isinstance(table, dict):
-        raise InputError(f"{where}: expected a table, found {table!r}")
-    for key in table:
-        if key not in known:
-            raise InputError(f"{where}: unknown key '{key}'; known are {', '.join(sorted(known))}")
 
 
 def _digest(content: Any) -> str:

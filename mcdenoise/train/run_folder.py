@@ -51,8 +51,8 @@ class RunFolder:
             raise InputError(f"{self.out}: expected a folder whose name is UTF-8; choose another one for the run")
         for name, content in identity.items():
             path = self.out / f"{name}.json"
-            if os.path.lexists(path) and (not path.is_file() or path.read_bytes() != _json(content).encode()):
-                raise InputError(f"{path}: {_difference(path, content)}; choose a new folder for a new run")
+            if os.path.lexists(path) and (difference := _difference(path, content)):
+                raise InputError(f"{path}: {difference}; choose a new folder for a new run")
 
     def claim(self, **identity: Any) -> None:
         """Write the identity of the run to ``NAME.json``, or check that an earlier run wrote the same.
@@ -179,20 +179,20 @@ def _last_step(line: bytes) -> float:
 
 
 def _difference(path: Path, content: Any) -> str:
-    """The settings of a stored run that are not those of this run, with both values."""
+    """The settings of a stored run that are not those of this run, with both values; empty if there are none."""
     try:
         stored = json.loads(read_text(path, _LARGEST))
         # Numbers and tuples as a file has them.
         wanted = json.loads(_json(content))
-        other = [name for name in {**wanted, **stored} if stored.get(name) != wanted.get(name)]
+        # A run of an earlier version has settings that are gone.
+        names = wanted if path.name == "config.json" else {**wanted, **stored}
+        other = [name for name in names if stored.get(name) != wanted.get(name)]
         expected, found = (
             ", ".join(f"{name}={reprlib.repr(values.get(name))}" for name in other) for values in (wanted, stored)
         )
-        if other:
-            return f"expected {expected} as in this run, found {found}"
+        return f"expected {expected} as in this run, found {found}" if other else ""
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        pass
-    return "expected the file of a run, found none that can be read"
+        return "expected the file of a run, found none that can be read"
 
 
 def _json(content: Any) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Self, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -14,39 +14,53 @@ from torch import Tensor
 Array: TypeAlias = NDArray[Any]
 
 
-class Shot(ABC):
-    """Consecutive frames on disk, as input of the network behind the front."""
+@dataclass(frozen=True)
+class Shot:
+    """Consecutive frames as input of the network behind the front.
+
+    Args:
+        buffers: for each noise seed a function that returns the buffers by name: ``(T, C, H, W)``, and
+            ``view_projection`` ``(T, 4, 4)``. One of fewer frames, such as a reference, is that of the last ones.
+        frames: indices of the frames of the shot in the buffers.
+        size: height and width in pixels.
+        referenced: index of the first frame that has a reference.
+        demodulated: whether the radiance of the color is demodulated.
+    """
+
+    buffers: tuple[Callable[[], Mapping[str, Array]], ...]
+    frames: range
+    size: tuple[int, int]
+    referenced: int = 0
+    demodulated: bool = False
+
+    @staticmethod
+    def of(*noise_seeds: Mapping[str, Array], demodulated: bool = False) -> Shot:
+        """A shot of arrays, with a reference for every frame.
+
+        Args:
+            noise_seeds: for each noise seed the arrays by name.
+            demodulated: whether the radiance of the color is demodulated.
+        """
+        frames, _, height, width = noise_seeds[0]["color"].shape
+        buffers = tuple(lambda each=each: each for each in noise_seeds)
+        return Shot(buffers, range(frames), (height, width), demodulated=demodulated)
+
+    def __len__(self) -> int:
+        return len(self.frames)
 
     @property
-    @abstractmethod
-    def size(self) -> tuple[int, int]:
-        """Height and width in pixels."""
-
-    @property
-    @abstractmethod
     def noise_seeds(self) -> int:
         """Number of noisy colors of a frame."""
+        return len(self.buffers)
 
     @property
-    @abstractmethod
     def references(self) -> int:
         """Number of the last frames that have a reference."""
+        return max(0, self.frames.stop - max(self.frames.start, self.referenced))
 
-    @property
-    @abstractmethod
-    def demodulated(self) -> bool:
-        """Whether the radiance of the color is demodulated."""
-
-    @abstractmethod
-    def __len__(self) -> int: ...
-
-    @abstractmethod
-    def cut(self, frames: slice) -> Self:
+    def cut(self, frames: slice) -> Shot:
         """Select consecutive frames; their history is kept."""
-
-    @abstractmethod
-    def views(self, frames: slice, rows: slice, columns: slice, noise_seed: int) -> Mapping[str, Array]:
-        """A part of each buffer, not copied where it need not be; the reference only of frames that have one."""
+        return replace(self, frames=self.frames[frames])
 
     def read(
         self,
@@ -60,6 +74,8 @@ class Shot(ABC):
     ) -> dict[str, Tensor]:
         """Copy a part of the shot: ``(T, C, H, W)`` float32 by name, and ``view_projection`` ``(T, 4, 4)``.
 
+        The reference is that of the frames that have one; where none has, it is left out.
+
         Args:
             frames: range of frames.
             rows: range of rows.
@@ -71,17 +87,21 @@ class Shot(ABC):
         Raises:
             InputError: a file is damaged.
         """
-        found = self.views(frames, rows, columns, noise_seed)
-        # Pixels are moved once, when they are copied.
-        return {
-            name: _copied(view if view.ndim == 3 else turn(view), channels.get(name)) for name, view in found.items()
-        }
+        buffers, chosen = self.buffers[noise_seed](), self.frames[frames]
+        found = {}
+        for name, array in buffers.items():
+            lacking = len(buffers["color"]) - len(array)
+            part = array[max(chosen.start - lacking, 0) : max(chosen.stop - lacking, 0)]
+            if len(part) and part.ndim == 3:
+                found[name] = torch.from_numpy(part.astype(np.float32))
+            elif len(part):
+                # Pixels are moved once, when they are copied.
+                found[name] = _copied(turn(part[:, :, rows, columns]), channels.get(name))
+        return found
 
 
 def _copied(image: Array, order: list[int] | None) -> Tensor:
     """Copy channels in this order, by default all, as float32."""
-    if image.ndim == 3:
-        return torch.from_numpy(image.astype(np.float32))
     channels = range(image.shape[1]) if order is None else order
     part = np.empty((image.shape[0], len(channels), *image.shape[2:]), np.float32)
     return torch.from_numpy(np.stack([image[:, i] for i in channels], 1, out=part))

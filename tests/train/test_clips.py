@@ -4,19 +4,17 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops import motion_from_position
-from mcdenoise.train.cache import CachedShot
 from mcdenoise.train.clips import Clip, ClipSampler
 from mcdenoise.train.front import ACCUMULATED
+from mcdenoise.train.shots import Shot
 
 PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
-def shot_of(stack: Tensor, *more_colors: Tensor) -> CachedShot:
-    """A shot that lies in memory, from ``(T, 17, H, W)`` and further noise seeds ``(T, 7, H, W)``."""
-    color, *features = (part.numpy() for part in stack.split([7, *list(PARTS.values())[3:]], 1))
-    names = list(PARTS)[3:]
-    colors = (color, *(more.numpy() for more in more_colors))
-    return CachedShot(colors, dict(zip(names, features, strict=True)), demodulated=True)
+def shot_of(stack: Tensor) -> Shot:
+    """A shot that lies in memory, from ``(T, 17, H, W)``."""
+    parts = stack.split(list(PARTS.values()), 1)
+    return Shot.of({name: part.numpy() for name, part in zip(PARTS, parts, strict=True)}, demodulated=True)
 
 
 def clip_of(stack: Tensor) -> Clip:
@@ -125,8 +123,8 @@ def test_motion_is_flipped_and_turned_with_the_image() -> None:
     motion = torch.stack([torch.zeros(2, size, size), torch.stack([x - columns, y - rows]).float()])
     motion[1, :, 4, 4] = torch.inf
     features = {"motion": motion.numpy(), "depth": depth.numpy(), "reference": torch.ones(2, 3, size, size).numpy()}
-    shot = CachedShot((torch.ones(2, 3, size, size).numpy(),), features)
-    clip = ClipSampler([shot], 2, size).draw(list(range(40)))
+    features["color"] = features["reference"]
+    clip = ClipSampler([Shot.of(features)], 2, size).draw(list(range(40)))
     views = {tuple(view[0, 0].flatten().tolist()) for view in clip["depth"]}
     assert len(views) == 8
     for numbers, vectors in zip(clip["depth"][:, :, 0], clip["motion"][:, 1], strict=True):
@@ -148,9 +146,8 @@ def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
     motion = torch.stack([motion_from_position(position[t : t + 1], views[max(t - 1, 0)][None])[0] for t in range(3)])
     features = {"position": position, "motion": motion, "view_projection": views}
     arrays = {name: value.numpy() for name, value in features.items()}
-    arrays["reference"] = torch.ones(3, 3, height, width).numpy()
-    shot = CachedShot((torch.ones(3, 3, height, width).numpy(),), arrays)
-    clip = ClipSampler([shot], 3, crop).draw(list(range(40)))
+    arrays["color"] = arrays["reference"] = torch.ones(3, 3, height, width).numpy()
+    clip = ClipSampler([Shot.of(arrays)], 3, crop).draw(list(range(40)))
     found = motion_from_position(clip["position"][:, 1].contiguous(), clip["view_projection"][:, 0].contiguous())
     # Pixel coordinates of some 100, of which float32 knows 1e-5; measured: 2e-5.
     torch.testing.assert_close(found, clip["motion"][:, 1], rtol=1e-4, atol=2e-4)

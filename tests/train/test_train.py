@@ -32,7 +32,7 @@ pytest.importorskip("tensorboard", reason="training needs the packages of mcdeno
 from mcdenoise.train import Progress, RunFolder, TrainConfig, train
 from mcdenoise.train.clips import Clip, ClipSampler
 
-SMALL: dict[str, Any] = {"width": 4, "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
+SMALL: dict[str, Any] = {"settings": "width=4", "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
 FIELDS = {field.name for field in dataclasses.fields(TrainConfig)}
 
 
@@ -93,7 +93,9 @@ def test_one_clip_is_learnt_by_heart(shared_sequence: Path, tmp_path: Path, monk
 
     monkeypatch.setattr(ClipSampler, "draw", draw_once)
     config = TrainConfig(
-        **{**SMALL, "width": 8, "frames": 3, "batch": 1, "steps": 30}, learning_rate=1e-2, draw_resolutions=False
+        **{**SMALL, "settings": "width=8", "frames": 3, "batch": 1, "steps": 30},
+        learning_rate=1e-2,
+        draw_resolutions=False,
     )
     train(config, [shared_sequence], tmp_path / "run", checkpoint_every=10, report=reports.append)
     assert [progress.step for progress in reports] == [10, 20, 30]
@@ -273,11 +275,9 @@ def test_another_config_or_other_data_need_another_folder(
     run = tmp_path / "run"
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     # One with another cache, too, which must not be filled for nothing.
-    message = refused(lambda: again(steps=2, settings="alpha_min=0.5", cache=tmp_path / "cache"))
-    assert (
-        f"{run / 'config.json'}: expected settings='alpha_min=0.5', steps=2 as in this run, found settings=''"
-        in message
-    )
+    message = refused(lambda: again(steps=2, settings="width=4,alpha_min=0.5", cache=tmp_path / "cache"))
+    expected = "expected settings='width=4,alpha_min=0.5', steps=2 as in this run, found settings='width=4'"
+    assert f"{run / 'config.json'}: {expected}" in message
     assert not (tmp_path / "cache").exists()
     assert f"{run / 'data.json'}: expected sequences=" in refused(lambda: again(shared_sequence, shared_sequence))
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
@@ -393,11 +393,9 @@ BAD: dict[str, tuple[Any, ...]] = {
     "losses": ("image=1,image=2", "image=much"),
     "crop": (64, 0),
     "frames": (9, 1),
-    "width": (-1,),
     "steps": (0,),
     "batch": (0,),
     "start_every": (0,),
-    "keep_fireflies": (-1,),
     "validation_frames": (-1,),
     "temporal_weight": (float("nan"),),
     "seed": (2**64,),
@@ -408,7 +406,7 @@ BAD: dict[str, tuple[Any, ...]] = {
     "ema": (1.0,),
     "exposure": (-1.0,),
     "tint": (float("nan"),),
-    "gloss": (1.5,),
+    "lamps": (1.5,),
 }
 
 
@@ -423,12 +421,12 @@ def test_settings_that_cannot_be_leave_no_run(shared_sequence: Path, tmp_path: P
 def test_a_run_can_start_from_weights(shared_sequence: Path, finished: Path, tmp_path: Path) -> None:
     """Without a width, the result is of that of the weights, and says so, so that it can be loaded."""
     first = finished / f"{DEFAULT}.safetensors"
-    config = TrainConfig(**{**SMALL, "steps": 1, "width": 0}, learning_rate=1e-12)
+    config = TrainConfig(**{**SMALL, "steps": 1, "settings": ""}, learning_rate=1e-12)
     second = train(config, [shared_sequence], tmp_path / "run", cache=finished / "cache", initial_weights=first)
     before, after = (load_weights(path).state_dict() for path in (first, second))
     for key, tensor in before.items():
         torch.testing.assert_close(after[key], tensor, rtol=1e-3, atol=1e-6)
     about = describe_weights(second)
     assert about["initial_weights"] == describe_weights(first)["sha256"]
-    assert about["settings"] == create_settings(width=SMALL["width"])
+    assert about["settings"] == create_settings(width=4)
     assert "data.json" in refused(lambda: train(config, [shared_sequence], tmp_path / "run", cache=finished / "cache"))
