@@ -4,7 +4,6 @@ import csv
 import functools
 import json
 import os
-import shlex
 import shutil
 import subprocess
 import sys
@@ -24,7 +23,6 @@ from torch import Tensor, nn
 import mcdenoise.benchmark.memory
 import mcdenoise.benchmark.sizes
 from mcdenoise.benchmark import Settings, Timed, benchmark_ops, choose_methods, make_method, run_benchmark
-from mcdenoise.benchmark.machine import busy_machine
 from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.operators import largest_case
 from mcdenoise.benchmark.scoring import Errors
@@ -212,20 +210,6 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
     with pytest.raises(KeyboardInterrupt):
         run_benchmark([open_sequence(small_sequence)], [scripted("A", interrupt)], out)
     assert sorted(out.parent.iterdir()) == before
-
-
-def test_a_command_that_does_not_exist_or_fails_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--beside: .*'no-such-program'"):
-        busy_machine(0, "no-such-program -x").__enter__()
-    failed = tmp_path / "failed"
-    command = [sys.executable, "-I", "-S", "-c", f"open({str(failed)!r}, 'w'); raise SystemExit(3)"]
-    machine = busy_machine(0, shlex.join(command))
-    machine.__enter__()
-    while not failed.exists():
-        time.sleep(0.05)
-    time.sleep(0.3)
-    with pytest.raises(InputError, match="status 3"):
-        machine.__exit__(None, None, None)
 
 
 def test_temporal_errors_use_successive_frames_and_infinite_values_are_skipped() -> None:
@@ -523,13 +507,13 @@ def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeyp
 def test_the_command_for_ops(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
     file = out.parent / "ops.json"
-    status, printed, _ = run("--ops", "downsample", "--size", "16x12", "--rounds", "2", "--json", file)
+    status, printed, _ = run("--ops", "downsample", "--sizes", "16x12", "--rounds", "2", "--json", file)
     assert status == 0
     written = json.loads(file.read_text())
     assert f"a copy moves {written['bandwidth']:.1f} GB/s" in printed
     assert {cost["op"] for cost in written["costs"]} == {"downsample"}
     assert not out.exists()
-    assert run("--ops", "--size", "1x1")[0] == 2
+    assert run("--ops", "--sizes", "1x1")[0] == 2
     assert "op: expected one of" in run("--ops", "no-such-op")[2]
 
 

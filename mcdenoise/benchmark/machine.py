@@ -1,16 +1,9 @@
-"""The machine that a benchmark runs on: its description, device, threads, free memory and background load."""
+"""The machine that a benchmark runs on: its description, device, threads and free memory."""
 
 from __future__ import annotations
 
 import os
 import platform
-import shlex
-import shutil
-import signal
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -19,24 +12,9 @@ import torch
 
 from mcdenoise.commit import source_commit
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import deaf_children
 from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
-# Python program that keeps a core busy.
-_SPIN = "while True: sum(range(100_000))"
-# Python program that repeats a command until it fails or the parent process has ended, for whatever reason.
-_REPEAT = """
-import os, signal, subprocess, sys, time
-command = None
-while os.getppid() == int(sys.argv[1]):
-    if command is None or command.poll() == 0:
-        command = subprocess.Popen(sys.argv[2:])
-    if command.poll():
-        sys.exit(command.returncode % 256)
-    time.sleep(0.05)
-os.killpg(0, signal.SIGKILL)
-"""
 _CGROUP = Path("/sys/fs/cgroup")
 
 
@@ -57,48 +35,6 @@ def fix_threads(threads: int) -> None:
     torch.set_num_threads(threads)
     oiio.attribute("threads", threads)
     oiio.attribute("exr_threads", threads)
-
-
-@contextmanager
-def busy_machine(cores: int, command: str = "") -> Iterator[None]:
-    """Run other processes inside this block: some that each keep a core busy, and a command that is repeated.
-
-    Args:
-        cores: number of processes that compute without waiting.
-        command: a command line, split as by a shell; its output is discarded. Empty for none.
-
-    Raises:
-        InputError: the command does not exist, or ended with a status other than 0.
-    """
-    arguments = shlex.split(command)
-    if arguments and shutil.which(arguments[0]) is None:
-        raise InputError(f"--beside: expected a command, found '{arguments[0]}', which is not a program; give its path")
-    commands = [[sys.executable, "-I", "-S", "-c", _SPIN]] * cores + ([arguments] if arguments else [])
-    started: list[subprocess.Popen[bytes]] = []
-    try:
-        for each in commands:
-            with deaf_children():
-                started.append(
-                    subprocess.Popen(
-                        [sys.executable, "-I", "-S", "-c", _REPEAT, str(os.getpid()), *each],
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.DEVNULL,
-                        stderr=subprocess.DEVNULL,
-                        start_new_session=True,
-                    )
-                )
-        yield
-        for process in started:
-            if process.poll() is not None:
-                raise InputError(
-                    f"--beside: expected a command that keeps running or ends with status 0, found status "
-                    f"{process.returncode}; run it by itself to see why"
-                )
-    finally:
-        for process in started:
-            with suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
 
 
 def describe_machine(device: str) -> Machine:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from mcdenoise.benchmark.machine import busy_machine, check_device, describe_machine, fix_threads
+from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, make_method, one_line
 from mcdenoise.benchmark.scoring import Errors
@@ -44,8 +44,6 @@ class Settings:
     Args:
         rounds: number of timed repetitions per frame, and per image size, after warming up; with 0 only errors are
             measured.
-        busy: number of cores that other processes keep busy while times are measured.
-        beside: a command that runs repeatedly while times are measured.
         threads: number of threads of torch, of methods that do not use torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
         sizes: widths and heights for measuring run time over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
@@ -61,8 +59,6 @@ class Settings:
     """
 
     rounds: int = 3
-    busy: int = 0
-    beside: str = ""
     threads: int = 1
     device: str = "cpu"
     sizes: tuple[Size, ...] = ()
@@ -74,7 +70,7 @@ class Settings:
     command: str = ""
 
     def __post_init__(self) -> None:
-        for name, minimum in (("rounds", 0), ("busy", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
+        for name, minimum in (("rounds", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
             if getattr(self, name) < minimum:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}: expected at least {minimum}, found {getattr(self, name)}")
@@ -144,20 +140,16 @@ def _measure(
         scenes.append(scene)
         cells += own
     sizes = list(settings.sizes) if settings.rounds else []
-    with busy_machine(settings.busy if sizes else 0, settings.beside if sizes else ""):
-        costs, fits = measure_sizes(
-            [method for method in made.methods if method.model != _IDENTITY],
-            made.denoisers,
-            sizes,
-            rounds=settings.rounds,
-            threads=settings.threads,
-            device=settings.device,
-            on_step=step,
-        )
-    notes = [f"measured beside: {settings.beside}"] if settings.beside else []
-    if settings.busy:
-        notes.append(f"measured beside {settings.busy} processes, each of which keeps a core busy")
-    notes += [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
+    costs, fits = measure_sizes(
+        [method for method in made.methods if method.model != _IDENTITY],
+        made.denoisers,
+        sizes,
+        rounds=settings.rounds,
+        threads=settings.threads,
+        device=settings.device,
+        on_step=step,
+    )
+    notes = [f"{name} is skipped where it cannot be computed: {reason}" for name, reason in skipped.items()]
     return Results(
         command=settings.command,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -215,9 +207,8 @@ class _SceneRun:
         """Measure the scene: returns it, and a cell for each method that is not missing."""
         try:
             self._warm_up(on_step)
-            with busy_machine(self._settings.busy, self._settings.beside):
-                for _ in range(self._settings.rounds):
-                    self._round(on_step)
+            for _ in range(self._settings.rounds):
+                self._round(on_step)
         except InputError as error:
             # A frame cannot be read, so no method has seen the whole scene.
             reason = one_line(error)

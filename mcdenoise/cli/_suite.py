@@ -36,7 +36,6 @@ def score_suite(
     patterns: str | None,
     models: str | None,
     precisions: str,
-    blender_python: Path | None,
     *,
     render: bool,
     json: Path | None,
@@ -60,7 +59,7 @@ def score_suite(
 
         if render:
             wanted = dict.fromkeys(row.shot for row in rows)
-            render_suite(wanted, data, blender_python=blender_python, threads=settings.threads, on_step=show)
+            render_suite(wanted, data, threads=settings.threads, on_step=show)
     if out is None:
         say(data)
         return 0

@@ -36,18 +36,14 @@ def benchmark(
     frames: str | None = None,
     rounds: int | None = None,
     threads: int | None = None,
-    busy: int = 0,
-    beside: str = "",
     device: str = "cpu",
-    sizes: str = SIZES,
+    sizes: str | None = None,
     pictures: int = 4,
     keep_all: bool = False,
     ops: bool = False,
-    size: str = "1280x720",
     suite: Literal["wild"] | None = None,
     data: Path | None = None,
     rows: str | None = None,
-    blender_python: Path | None = None,
     render: bool = True,
     json: Json = None,
 ) -> int:
@@ -76,19 +72,15 @@ def benchmark(
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.
         rounds: number of timed repetitions of each frame and of each size; 3 by default, 5 with --ops, 1 with --suite.
         threads: number of CPU threads of all methods; torch's default if not given.
-        busy: number of cores that other processes keep busy while times are measured, as a renderer would.
-        beside: a command that runs repeatedly while times are measured, such as a rendering.
         device: cpu or cuda.
-        sizes: sizes of synthetic images for measuring run time over pixels, such as 1280x720,3840x2160, or none.
+        sizes: sizes of synthetic images for measuring run time over pixels, such as 1280x720,3840x2160, or none; five
+            by default. With --ops one size, that of the images; 1280x720 by default.
         pictures: number of frames of each scene whose images are stored.
         keep_all: measure each method that skips work a second time without skipping, to see what skipping saves.
         ops: measure operators: those that are named in place of folders, or all.
-        size: size of the images with --ops, WIDTHxHEIGHT.
         suite: render and score the suite of this name.
         data: folder of the suite's frames.
         rows: rows of the suite to score, such as "cycles-*,mitsuba-parlour-box-4"; all by default.
-        blender_python: a Python with Blender's module bpy, for the suite's rows of Cycles; by default that of the
-            environment variable BLENDER_PYTHON, or else the Python that runs mcdenoise.
         render: with --no-render, score the rows that exist in the folder of --data, and render nothing.
         json: write the content of results.json, or ops.json, to this file too.
     """
@@ -98,14 +90,14 @@ def benchmark(
     command = _command_line({name: value for name, value in locals().items() if name != "json"})
     rounds = rounds if rounds is not None else 5 if ops else 1 if suite else 3
     if ops and suite is None:
-        return _time_ops(sequences, parse_size(size), rounds, threads, device, out, command, json)
+        return _time_ops(
+            sequences, parse_size(sizes or "1280x720", "--sizes"), rounds, threads, device, out, command, json
+        )
     settings = Settings(
         rounds=rounds,
         threads=threads,
-        busy=busy,
-        beside=beside,
         device=device,
-        sizes=tuple(parse_sizes(sizes)),
+        sizes=tuple(parse_sizes(sizes or SIZES)),
         pictures=pictures,
         command=command,
     )
@@ -114,9 +106,7 @@ def benchmark(
             raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
         if data is None:
             raise InputError("--data: expected the folder of the suite's frames, found none; give one")
-        return score_suite(
-            data, out, settings, rows, models, precisions or "float32", blender_python, render=render, json=json
-        )
+        return score_suite(data, out, settings, rows, models, precisions or "float32", render=render, json=json)
     if not sequences:
         if out is None or not os.path.exists(out / FILE):
             raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
