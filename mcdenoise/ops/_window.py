@@ -91,16 +91,20 @@ def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> 
     for dim, (before, after) in ((-2, rows), (-1, columns)):
         size = image.shape[dim]
         # A graph for any image size cannot branch on it.
-        if torch.compiler.is_compiling() or size < max(before, after):
-            place = torch.arange(-before, size + after, device=image.device)
-            # Graphs in ONNX divide by no number that is a size.
-            place = place % torch.full_like(place, 2 * size)
-            image = image.index_select(dim, torch.where(place < size, place, 2 * size - 1 - place))
-        elif before or after:
-            # In a fifth of the time.
-            ends = image.narrow(dim, 0, before).flip(dim), image.narrow(dim, size - after, after).flip(dim)
+        if torch.compiler.is_compiling() or before or after:
+            ends = [
+                image.index_select(dim, _mirrored(torch.arange(*place, device=image.device), size))
+                for place in ((-before, 0), (size, size + after))
+            ]
             image = torch.cat([ends[0], image, ends[1]], dim)
     return image
+
+
+def _mirrored(place: Tensor, size: int) -> Tensor:
+    """The places in an image of some size that are shown at places outside, by mirrors at both ends."""
+    # Graphs in ONNX divide by no number that is a size.
+    place = place % torch.full_like(place, 2 * size)
+    return torch.where(place < size, place, 2 * size - 1 - place)
 
 
 def corner(image: Tensor, height: int, width: int) -> Tensor:

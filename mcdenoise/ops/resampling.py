@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
@@ -71,8 +73,8 @@ def resample(previous: Tensor, motion: Tensor) -> Tensor:
             tap = source.gather(2, index.expand(-1, source.shape[1], -1)).reshape(value.shape)
             value = value + across[i] * down[j] * tap
             nearest += [tap] if i in (1, 2) and j in (1, 2) else []
-    around = torch.stack(nearest)
-    value = torch.minimum(torch.maximum(value, around.amin(0)), around.amax(0))
+    least, most = (reduce(limit, nearest) for limit in (torch.minimum, torch.maximum))
+    value = torch.minimum(torch.maximum(value, least), most)
     return torch.where(known, value, 0).to(previous.dtype)
 
 
