@@ -32,10 +32,9 @@ from mcdenoise.benchmark import (
     Settings,
     choose_methods,
     folded,
+    mean_over_scenes,
     run_benchmark,
     scores_of,
-    summary,
-    verdicts,
 )
 from mcdenoise.benchmark.tables import remarks
 from mcdenoise.data import open_sequence
@@ -99,7 +98,7 @@ def main() -> None:
     scores = scores_of(results)
 
     print(table(folded(scores, BY), options.markdown))
-    means = summary(scores, BY) if len(sequences) > 1 else []
+    means = folded(mean_over_scenes(scores), BY) if len(sequences) > 1 else []
     if means:
         print(f"\n{table(means, options.markdown)}")
     floors = {sequence.name: noise_floor(sequence) for sequence in sequences}
@@ -112,29 +111,13 @@ def main() -> None:
     notes += [f"{line}." for line in remarks(results)]
     if "FLIP" in metrics and options.flip_every > 1:
         notes.append(f"FLIP: of one in {options.flip_every} frames.")
-    shown = {score.method for score in scores}
-    ours = [method.name for method in methods if method.kind == "trainable" and method.name in shown]
-    against = [
-        verdict
-        for family in dict.fromkeys(score.family for score in scores if score.family)
-        for name in ours
-        for verdict in verdicts(scores, name, family)
-        if family in options.sweep
-    ]
-    told = [
-        f"{v['metric']}: {v['method']} {v['value']:.4g}; {v['family']}'s best single setting {v['single']:.4g} "
-        f"({v['setting']}), its best of each scene {v['best']:.4g}; not better in: {', '.join(v['lost']) or 'none'}"
-        for v in against
-    ]
-    for lines in (notes, told):
-        if lines:
-            print("\n" + "\n".join(f"- {line}" if options.markdown else line for line in lines))
+    if notes:
+        print("\n" + "\n".join(f"- {line}" if options.markdown else line for line in notes))
     if options.json:
         everything = {
             "scores": [asdict(score) for score in scores],
             "folded": [asdict(score) for score in folded(scores, BY)],
             "summary": [asdict(score) for score in means],
-            "verdicts": against,
             "reference_noise": {scene.name: scene.reference_noise for scene in results.scenes},
             "noise_floor": floors,
             "flip_every": options.flip_every,

@@ -1,8 +1,8 @@
-"""Many methods, settings and scenes in short: means, the best settings, and who is ahead."""
+"""Many methods, settings and scenes in short: means and the best settings."""
 
 import pytest
 
-from mcdenoise.benchmark import Score, folded, summary, verdicts
+from mcdenoise.benchmark import Score, folded, mean_over_scenes
 
 
 def by_method(scores: list[Score]) -> dict[str, Score]:
@@ -45,21 +45,10 @@ def test_settings_fold_to_the_best_of_each_metric(two_scenes: list[Score]) -> No
     assert one["ours"].values == {"SMAPE": 0.09, "PSNR": 29}
 
 
-def test_summary_tells_one_setting_for_all_from_one_for_each(two_scenes: list[Score]) -> None:
-    rows = by_method(summary(two_scenes, ("quality",)))
-    best, of_each = "oidn, best of 4 settings", "oidn, best of each scene"
-    assert list(rows) == ["noisy", "oidn(quality=fast)", "oidn(quality=high)", best, of_each, "ours"]
-    # Means of A, B, C: 0.2, 0.16, 0.15. Best of each scene: 0.10 and 0.12.
+def test_one_setting_is_the_best_for_all_scenes(two_scenes: list[Score]) -> None:
+    rows = by_method(folded(mean_over_scenes(two_scenes), ("quality",)))
+    best = "oidn, best of 4 settings"
+    assert list(rows) == ["noisy", "oidn(quality=fast)", "oidn(quality=high)", best, "ours"]
+    # Means of A, B, C: 0.2, 0.16, 0.15.
     assert rows[best].values == pytest.approx({"SMAPE": 0.15, "PSNR": 28})
     assert rows[best].chosen == {"SMAPE": "C", "PSNR": "D"}
-    assert rows[of_each].values == pytest.approx({"SMAPE": 0.11, "PSNR": 28})
-
-
-def test_verdicts(two_scenes: list[Score]) -> None:
-    smape, psnr = verdicts(two_scenes, "ours")
-    expected = {"metric": "SMAPE", "method": "ours", "family": "oidn", "setting": "C", "lost": ["two"]}
-    assert smape == expected | {
-        name: pytest.approx(x) for name, x in (("value", 0.11), ("single", 0.15), ("best", 0.11))
-    }
-    # 29 and 31 dB against 30 and 26 dB: higher is better, and 29 is not.
-    assert (psnr["setting"], psnr["lost"]) == ("D", ["one"])

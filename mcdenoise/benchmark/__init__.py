@@ -1,6 +1,6 @@
 """Error against run time: the chosen methods take turns on the same frames, in the same run."""
 
-from mcdenoise.benchmark.comparison import Score, folded, mean_over_scenes, scores_of, summary, verdicts
+from mcdenoise.benchmark.comparison import Score, folded, mean_over_scenes, scores_of
 from mcdenoise.benchmark.methods import BASELINES, COMPARED, Timed, choose_methods, make_method
 from mcdenoise.benchmark.operators import benchmark_ops
 from mcdenoise.benchmark.run import Settings, run_benchmark
@@ -20,6 +20,4 @@ __all__ = [
     "parse_sizes",
     "run_benchmark",
     "scores_of",
-    "summary",
-    "verdicts",
 ]

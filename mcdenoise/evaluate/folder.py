@@ -17,6 +17,7 @@ from torch import Tensor
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.exr import Metadata
+from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -40,7 +41,7 @@ from mcdenoise.ops import Surface
 STRICT: ProtocolName = "strict"
 WARPED, FLICKER = "wRMSE", "flicker"
 _METRICS = {**{name: METRICS[name] for name in USUAL}, "HDR-FLIP": Metric(flip_hdr)}
-_OURS = re.compile(r"denoised(\d+)")
+_OURS = re.compile(r"denoised\d+")
 # Maximum motion, in pixels, of a shot that counts as static.
 _STILL = 0.05
 
@@ -149,15 +150,17 @@ def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
     if not os.path.isdir(folder):
         found = f"a file for {len(numbers)} frames" if os.path.isfile(folder) else "no such folder"
         raise InputError(f"{folder}: expected a folder of denoised EXR images, found {found}; check the path")
-    stems = [path.stem for path in sorted(folder.glob("*.exr")) if not path.name.startswith(".")]
-    if not stems:
+    paths = [path for path in sorted(folder.glob("*.exr")) if not path.name.startswith(".")]
+    if not paths:
         raise InputError(f"{folder}: expected denoised EXR images, found none; check the path")
-    files: dict[int, Path] = {}
-    for number, stem in _numbered(folder, [stem for stem in stems if _OURS.fullmatch(stem)] or stems):
-        path = folder / f"{stem}.exr"
-        other = files.setdefault(number, path)
-        if other is not path:
-            raise InputError(f"{folder}: expected one file a frame, found {other.name} and {path.name}; remove one")
+    (group, *others), _ = group_files([path for path in paths if _OURS.fullmatch(path.stem)] or paths)
+    if others:
+        shown = ", ".join(next(iter(each.files.values())).name for each in (group, others[-1]))
+        raise InputError(
+            f"{folder}: expected names that differ in one number, that of the frame, such as denoised12.exr or "
+            f"frame.0012.exr, found {shown}; keep only one series of images in the folder"
+        )
+    files = group.files
     missing = [number for number in numbers if number not in files]
     if missing:
         raise InputError(
@@ -166,23 +169,6 @@ def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
             f"(it has frames {min(files)} to {max(files)}); denoise all frames, or choose some with --frames"
         )
     return {number: files[number] for number in numbers}
-
-
-def _numbered(folder: Path, stems: list[str]) -> list[tuple[int, str]]:
-    """Frame number and file stem of each file, from the one number in which the stems differ."""
-    # Text and numbers alternate, with the numbers at odd indices.
-    split = [re.split(r"(\d+)", stem) for stem in stems]
-    alike = {tuple(parts[::2]) for parts in split}
-    changing = [i for i in range(1, len(split[0]), 2) if len({parts[i] for parts in split if i < len(parts)}) > 1]
-    if len(stems) == 1 and len(split[0]) == 3:
-        changing = [1]
-    if len(alike) > 1 or len(changing) != 1:
-        shown = ", ".join(f"{stem}.exr" for stem in (stems[0], stems[-1])[: len(stems)])
-        raise InputError(
-            f"{folder}: expected names that differ in one number, that of the frame, such as denoised12.exr or "
-            f"frame.0012.exr, found {shown}; keep only one series of images in the folder"
-        )
-    return [(int(parts[changing[0]]), stem) for parts, stem in zip(split, stems, strict=True)]
 
 
 def evaluate_folder(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear, temporal_smape_linear
+from mcdenoise.metrics._check import check_images
 from mcdenoise.models import Output
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._steps.transfer import compress
@@ -109,8 +110,7 @@ def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float 
     Raises:
         ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
     """
-    if image.shape != reference.shape:
-        raise ValueError(f"image: expected shape {tuple(reference.shape)} as reference, found {tuple(image.shape)}")
+    check_images(image, reference)
     shown, wanted = (each.clamp_min(0).add(_DARK).pow(1 / 2.2) for each in (image, reference))
     spatial = (shown - wanted).abs().mean()
     return spatial + temporal_weight * temporal_smape_linear(image, reference).mean() if temporal_weight else spatial
@@ -151,8 +151,7 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
         >>> round(rae_loss(torch.zeros_like(clip), clip).item(), 4)  # 0.8 log(1.5)
         0.3244
     """
-    if image.shape != reference.shape:
-        raise ValueError(f"image: expected shape {tuple(reference.shape)} as reference, found {tuple(image.shape)}")
+    check_images(image, reference)
     error = torch.log1p(image) - torch.log1p(reference)
     frames = error.shape[1]
     counts = torch.exp(-torch.arange(frames - 1, -1, -1, device=error.device).to(error.dtype).square() / 8)
@@ -200,8 +199,7 @@ def oidn_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1)
         >>> round(oidn_loss(clip, clip).item(), 6)
         0.0
     """
-    if image.shape != reference.shape:
-        raise ValueError(f"image: expected shape {tuple(reference.shape)} as reference, found {tuple(image.shape)}")
+    check_images(image, reference)
     exposure = oidn_exposure(reference[:, -1])[:, None]
     shown, wanted = (compress(each * exposure) for each in (image, reference))
     error = shown - wanted

@@ -129,7 +129,7 @@ def test_the_denoisers_loss_is_its_equation() -> None:
     flicker = (error[:, 1] - error[:, 0]).abs().mean()
     expected = 0.16 * error.abs().mean() + 0.84 * (1 - alike.mean()) + 0.3 * flicker
     torch.testing.assert_close(oidn_loss(image, reference, temporal_weight=0.3), expected)
-    with pytest.raises(ValueError, match="as reference"):
+    with pytest.raises(ValueError, match="reference"):
         oidn_loss(image, reference[:, :1])
 
 
