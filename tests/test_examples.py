@@ -22,7 +22,6 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 RENDERERS = Path(__file__).parent / "data" / "renderers"
 # Arguments of the examples that measure, which take long: each as small as it may be.
 MEASURING = {
-    "error_vs_runtime.py": "{shot} -o {out}/figure.svg --models noisy --rounds 1 --frames 1-2 --threads 1",
     "start_up.py": "--size 64x48 --rounds 1 --threads 1 --quality fast --json {out}/times.json",
     "training_speed.py": "{shot} --model cascaded_v2_micro --batch 1 --frames 2 --crop 16 --threads 1 --rounds 1",
     "film_scale.py": "--nodes 2 --shots 1 --frames 2 --json {out}/scale.json",
@@ -143,7 +142,7 @@ def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MEASURING)
 def test_what_measures_runs(name: str, small_sequence: Path, tmp_path: Path) -> None:
-    for package in ("pyoidn", "matplotlib", "lightning_fabric", "ray"):
+    for package in ("pyoidn", "lightning_fabric", "ray"):
         pytest.importorskip(package)
     assert run(name, *MEASURING[name].format(shot=small_sequence, out=tmp_path).split())
 

@@ -1,5 +1,5 @@
 """The report of a benchmark: one page that opens anywhere, and its plots for papers."""
 
-from mcdenoise.report.writing import check_packages, render_page, write_error_plot, write_report, write_sample_plots
+from mcdenoise.report.writing import check_packages, render_page, write_report, write_sample_plots
 
-__all__ = ["check_packages", "render_page", "write_error_plot", "write_report", "write_sample_plots"]
+__all__ = ["check_packages", "render_page", "write_report", "write_sample_plots"]

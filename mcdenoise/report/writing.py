@@ -80,32 +80,6 @@ def write_report(folder: Path) -> Path:
     return path
 
 
-def write_error_plot(results: Results, metric: str, path: Path) -> list[Row]:
-    """Draw error over time alone: the mean over the scenes, or the one scene.
-
-    Args:
-        results: of a benchmark.
-        metric: name in :data:`mcdenoise.evaluate.METRICS`.
-        path: of the figure; its ending says which kind, such as ``.svg`` or ``.png``.
-
-    Returns:
-        The points that are drawn, by method.
-
-    Raises:
-        InputError: the metric was not computed, the ending is unknown, or the file cannot be written.
-    """
-    check_packages()
-    from mcdenoise.report import plots
-
-    if metric not in (known := metrics(results)):
-        raise InputError(f"metric: expected one of {', '.join(known)}, found {metric}")
-    shown = views(results)[0]
-    with plots.plot_style():
-        figure = plots.error_over_time(shown, metric, plots.model_colors(results.methods))
-        plots.write_figure(figure, path)
-    return shown.rows
-
-
 def write_sample_plots(curves: Mapping[str, dict[str, list[tuple[int, float]]]], folder: Path) -> list[Path]:
     """Draw SMAPE over samples, ``plots/NAME-over-samples.svg``.
 

@@ -260,20 +260,7 @@ def verdict(lines: list[Line]) -> list[str]:
 
 def _table(lines: list[Line]) -> list[str]:
     columns = ((SMAPE, ".4f"), (PSNR, ".2f"), (TEMPORAL, ".4f"))
-    heads = [
-        "row",
-        "SMAPE",
-        "OIDN",
-        "ratio",
-        "PSNR",
-        "OIDN",
-        "tRMSE",
-        "OIDN",
-        "ms",
-        "OIDN",
-        "OIDN's setting",
-        "reference",
-    ]
+    heads = ["row", "SMAPE", "OIDN", "ratio", "PSNR", "OIDN", "tRMSE", "OIDN", "ms", "OIDN"]
     rows = []
     for line in lines:
         cells = [_number(values.get(name), form) for name, form in columns for values in (line.values, _of_best(line))]
