@@ -201,9 +201,11 @@ def export_model(
     inputs = (*step.given, *(f"state.{each}" for each in step.state))
     outputs = ("image", *(f"next_state.{each}" for each in step.state))
     about = {"model": name or type(model).__name__, "mcdenoise": version("mcdenoise"), "torch": torch.__version__}
-    write = _write_onnx if path.suffix == ".onnx" else _write_torch
-    with atomic_path(path) as temporary:
-        write(program, temporary, inputs, outputs, about)
+    with atomic_path(path) as temporary, _quiet():
+        if path.suffix == ".onnx":
+            _write_onnx(program, temporary, inputs, outputs, about)
+        else:
+            torch.export.save(program, temporary, extra_files=about)
     return Exported(path, inputs, outputs, len(program.graph.nodes))
 
 
@@ -279,10 +281,9 @@ def _write_onnx(
     about: dict[str, str],
 ) -> None:
     try:
-        with _quiet():
-            written = torch.onnx.export(
-                program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
-            )
+        written = torch.onnx.export(
+            program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
+        )
     except Exception as error:
         first: BaseException = error
         while first.__cause__ is not None:
@@ -304,17 +305,6 @@ def _write_onnx(
     for each in graph.inputs:
         each.shape = after.get(each.name, each.shape)
     written.save(path, external_data=False)
-
-
-def _write_torch(
-    program: torch.export.ExportedProgram,
-    path: Path,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    about: dict[str, str],
-) -> None:
-    with _quiet():
-        torch.export.save(program, path, extra_files=about)
 
 
 @contextmanager

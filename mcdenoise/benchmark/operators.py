@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -131,25 +132,29 @@ def benchmark_ops(
             f"found {width}x{height}, {rounds} and {threads}"
         )
     check_device(device)
-    if out is None:
-        return _measure(size, rounds, threads, device, command, list(ops), on_step)
-    with new_folder(out) as folder:
-        results = _measure(size, rounds, threads, device, command, list(ops), on_step)
-        results.write(folder)
-        write_ops_csv(results, folder)
+    with new_folder(out) if out is not None else nullcontext() as folder:
+        fix_threads(threads)
+        entries, bandwidth = _measured(list(ops), size, rounds, device, on_step)
+        results = OpResults(
+            command=command,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            machine=describe_machine(device),
+            width=width,
+            height=height,
+            rounds=rounds,
+            bandwidth=bandwidth / 1e9,
+            costs=[entry.cost(bandwidth) for entry in entries],
+        )
+        if folder is not None:
+            results.write(folder)
+            write_ops_csv(results, folder)
     return results
 
 
-def _measure(
-    size: tuple[int, int],
-    rounds: int,
-    threads: int,
-    device: str,
-    command: str,
-    ops: list[Op],
-    on_step: Callable[[int, int], None],
-) -> OpResults:
-    fix_threads(threads)
+def _measured(
+    ops: list[Op], size: tuple[int, int], rounds: int, device: str, on_step: Callable[[int, int], None]
+) -> tuple[list[_Entry], float]:
+    """What was measured of every op, and the bytes that a copy moves in a second."""
     source = torch.ones(_COPY_BYTES // 4, device=device)
     target = torch.empty_like(source)
     copies: list[float] = []
@@ -160,17 +165,7 @@ def _measure(
         entries += own
         on_step(done, len(ops))
     # Read once, and written once.
-    bandwidth = 2 * _COPY_BYTES * 1e3 / Spread.of(copies).median
-    return OpResults(
-        command=command,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        machine=describe_machine(device),
-        width=size[0],
-        height=size[1],
-        rounds=rounds,
-        bandwidth=bandwidth / 1e9,
-        costs=[entry.cost(bandwidth) for entry in entries],
-    )
+    return entries, 2 * _COPY_BYTES * 1e3 / Spread.of(copies).median
 
 
 def _take_turns(

@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLoc
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.views import Point, Range, Row, View, pareto_front, points
+from mcdenoise.report.views import Range, Row, View, front, points
 from mcdenoise.results import STAGES, Cost, Method, Results
 
 # Okabe and Ito 2008, told apart with every kind of colour blindness; behind them four more, for ten models.
@@ -112,21 +112,21 @@ def error_over_time(view: View, metric: str, colors: dict[str, str]) -> Figure:
     axes.set_xlabel("milliseconds a frame, without reading and writing files")
     if not shown:
         return _empty(axes)
-    _log_axis(axes, "x", [point.milliseconds for point in shown])
+    _log_axis(axes, "x", [time for _, time, _ in shown])
     if higher:
-        _linear_axis(axes, [point.error for point in shown])
+        _linear_axis(axes, [error for _, _, error in shown])
     else:
-        _log_axis(axes, "y", [point.error for point in shown])
-    front = pareto_front([(point.milliseconds.value, point.error.value) for point in shown], higher_is_better=higher)
-    _draw_front(axes, [(shown[index].milliseconds.value, shown[index].error.value) for index in front])
-    for point in shown:
-        color = colors[point.row.method.model]
-        for start, end in _bars(point):
-            axes.plot(*zip(start, end, strict=True), color=color, linewidth=1.1, alpha=0.65, zorder=3)
-        _mark(axes, point.row.method, point.row.number, point.milliseconds.value, point.error.value, color)
+        _log_axis(axes, "y", [error for _, _, error in shown])
+    places = {row.number: (time.value, error.value) for row, time, error in shown}
+    best = [row.number for row in front(view, metric)]
+    _draw_front(axes, [places[number] for number in best])
+    for row, x, y in shown:
+        about: Any = {"color": colors[row.method.model], "linewidth": 1.1, "alpha": 0.65, "zorder": 3}
+        axes.plot((x.lower, x.upper), (y.value, y.value), **about)
+        axes.plot((x.value, x.value), (y.lower, y.upper), **about)
+        _mark(axes, row.method, row.number, x.value, y.value, colors[row.method.model])
     _draw_idle(axes, idle, metric)
-    places = {point.row.number: (point.milliseconds.value, point.error.value) for point in shown}
-    _write_numbers(axes, places, _CORNERS, bold={shown[index].row.number for index in front})
+    _write_numbers(axes, places, _CORNERS, bold=best)
     return figure
 
 
@@ -314,13 +314,6 @@ def _linear_axis(axes: Axes, ranges: Sequence[Range]) -> None:
     low, high = min(values, default=0.0), max(values, default=1.0)
     margin = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
     axes.set_ylim(low - margin, high + margin)
-
-
-def _bars(point: Point) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-    """Both ends of the bar of each spread."""
-    x, y = point.milliseconds, point.error
-    yield (x.lower, y.value), (x.upper, y.value)
-    yield (x.value, y.lower), (x.value, y.upper)
 
 
 def _mark(axes: Axes, method: Method, number: int, x: float, y: float, color: str) -> None:

@@ -69,21 +69,6 @@ class View:
     rows: list[Row]
 
 
-@dataclass(frozen=True)
-class Point:
-    """A method in the plot of error over time.
-
-    Args:
-        row: whose.
-        milliseconds: a frame.
-        error: in the metric of the plot.
-    """
-
-    row: Row
-    milliseconds: Range
-    error: Range
-
-
 def views(results: Results) -> list[View]:
     """The mean over the scenes, where there are several, and each scene.
 
@@ -148,10 +133,10 @@ def metrics(results: Results) -> list[str]:
     return [name for name in METRICS if name in found]
 
 
-def points(view: View, metric: str) -> list[Point]:
-    """The methods that have both a time and an error."""
+def points(view: View, metric: str) -> list[tuple[Row, Range, Range]]:
+    """The methods that have both a time and an error, each with milliseconds and the error."""
     return [
-        Point(row, row.milliseconds, row.errors[metric])
+        (row, row.milliseconds, row.errors[metric])
         for row in view.rows
         if row.milliseconds is not None and row.milliseconds.value > 0 and metric in row.errors
     ]
@@ -160,9 +145,9 @@ def points(view: View, metric: str) -> list[Point]:
 def front(view: View, metric: str) -> list[Row]:
     """The methods on the Pareto front of run time and error, by rising run time."""
     shown = points(view, metric)
-    values = [(point.milliseconds.value, point.error.value) for point in shown]
+    values = [(time.value, error.value) for _, time, error in shown]
     higher = metric in METRICS and METRICS[metric].higher_is_better
-    return [shown[index].row for index in pareto_front(values, higher_is_better=higher)]
+    return [shown[index][0] for index in pareto_front(values, higher_is_better=higher)]
 
 
 def pareto_front(values: Sequence[tuple[float, float]], *, higher_is_better: bool = False) -> list[int]:
