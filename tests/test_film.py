@@ -63,12 +63,12 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_mean_of_noisy_colors_and_features_is_that_of_many_samples(tmp_path: Path, name: str) -> None:
     """Albedo and color of a wall in even light are one and the same image, filtered by the same filter.
 
-    Each noisy color is a mean of 4 samples; 30 of them give the standard error. Filters wider than a pixel divide by
+    Each noisy color is a mean of 4 samples; 12 of them give the standard error. Filters wider than a pixel divide by
     the weight of the samples that were drawn: a quotient of random numbers, whose bias at 4 samples is below 0.02 here.
     """
-    runs = 30
+    runs = 12
     folder = render_sequence(
-        wall(), AT_WALL, tmp_path, spp=4, noise_seeds=runs, reference_spp=512, film=Film(name), max_depth=2, **SCALAR
+        wall(), AT_WALL, tmp_path, spp=4, noise_seeds=runs, reference_spp=256, film=Film(name), max_depth=2, **SCALAR
     )
     places = [folder, *(folder / f"noise_seed{k}" for k in range(1, runs))]
     colors = np.array([read(place, "color0") for place in places])

@@ -18,7 +18,6 @@ from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.metrics import smape_linear
 from mcdenoise.models import FrameReport, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
@@ -193,7 +192,7 @@ def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
         render_sequence(scene, demo_cameras(1), tmp_path, **settings)
 
 
-@pytest.mark.parametrize("missing", [None, "frames", "camera_matrices", "reference_spp"])
+@pytest.mark.parametrize("missing", [None, "frames", "camera_matrices"])
 def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missing: str | None) -> None:
     folder, cameras = tmp_path / "inputs", demo_cameras(9)
     shutil.copytree(sequence, folder)
@@ -226,33 +225,6 @@ def test_known_radiance_and_the_background(tmp_path: Path) -> None:
     depth = open_sequence(tmp_path).frame(0).depth
     assert depth is not None
     assert torch.equal(torch.isinf(depth[0, 0]), torch.from_numpy(~hit))
-
-
-def test_noisy_frames_are_independent_and_their_mean_is_the_reference(tmp_path: Path) -> None:
-    frames, blocks = 96, (3, 4)
-    camera = demo_cameras(1)[0]
-    folder = render_sequence(
-        demo_scene(),
-        [camera] * frames,
-        tmp_path,
-        size=(16, 9),
-        variant="scalar_rgb",
-        reference_spp=768,
-        reference_frames=[0],
-    )
-
-    def block_means(image: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        rows, columns = blocks
-        return np.asarray(image.reshape(rows, 9 // rows, columns, 16 // columns, 3).mean(axis=(1, 3)))
-
-    noisy = np.stack([block_means(read(folder, f"color{number}").astype(np.float64)) for number in range(frames)])
-    reference = block_means(read(folder, "reference0").astype(np.float64))
-    error = noisy.std(axis=0, ddof=1) * np.sqrt(1 / frames + 1 / 768)
-    z = (noisy.mean(axis=0) - reference) / error
-    assert np.abs(z).max() < 5
-    assert np.abs(z.mean()) < 1
-    residual = np.log1p(noisy) - np.log1p(noisy).mean(axis=0)
-    assert abs((residual[1:] * residual[:-1]).sum() / (residual**2).sum()) < 0.12
 
 
 def test_variants_agree(tmp_path: Path) -> None:
@@ -381,14 +353,6 @@ def test_camera_paths_of_tungsten_scenes(tmp_path: Path) -> None:
         np.testing.assert_allclose([camera.to_world for camera in cameras], expected)
     (one,) = load_camera_path(scenes / "spp_4096_scene_2.json").cameras
     np.testing.assert_allclose(one.to_world, expected[1])
-
-
-@pytest.mark.skipif(not SHARED_SCENES.is_dir(), reason=f"needs the scenes in {SHARED_SCENES}")
-def test_published_flythroughs() -> None:
-    paths = sorted(SHARED_SCENES.glob("*/tungsten_flythrough.json"))
-    assert paths
-    for path in paths:
-        assert len(load_camera_path(path).cameras) > 10
 
 
 @pytest.mark.parametrize(
@@ -532,19 +496,6 @@ def test_refining_a_reference_continues_where_it_was(tmp_path: Path) -> None:
     assert describe(folder)["reference_spp"] == {"0": 96}
 
 
-def test_the_estimated_noise_is_the_error_against_a_better_reference(tmp_path: Path) -> None:
-    rough, good = (
-        render_sequence(demo_scene(), demo_cameras(1), tmp_path / str(spp), reference_spp=spp, **TINY)
-        for spp in (128, 2048)
-    )
-    reference, truth = (torch.from_numpy(read(folder, "reference0")).permute(2, 0, 1) for folder in (rough, good))
-    estimated = describe(rough)["reference_noise"]["0"]
-    # Measured over six seeds: 6 % too little, because of the few bright paths that none of the halves has met.
-    np.testing.assert_allclose(smape_linear(reference, truth).item(), estimated, rtol=0.2)
-    # 16 times the paths: a quarter of the noise.
-    assert describe(good)["reference_noise"]["0"] < estimated / 3
-
-
 def test_references_end_at_a_noise_level(tmp_path: Path) -> None:
     calls: list[tuple[int, int]] = []
 
@@ -658,28 +609,6 @@ def test_moving_points_stay_on_their_surface(moving: Path) -> None:
         assert on_ball.sum() > 20
         radius = np.linalg.norm(before - center - moves[frame - 1, :3, 3], axis=-1)
         np.testing.assert_allclose(radius[on_ball], 0.8, atol=1e-4)
-
-
-def test_the_previous_frame_shows_the_same_point_where_the_previous_position_projects_to(moving: Path) -> None:
-    for frame in range(1, FLIGHT):
-        now, before = (
-            read(moving, f"{name}{frame}").astype(np.float64) for name in ("world_position", "previous_position")
-        )
-        moved = (now != before).any(axis=-1)
-        shown, seen, found = read(moving, f"world_position{frame - 1}"), read(moving, f"albedo{frame - 1}"), {}
-        matrix = np.array(describe(moving)["camera_matrices"][frame - 1])
-        for name, point in (("previous", before), ("position", now)):
-            clip = np.concatenate([point[moved], np.ones((moved.sum(), 1))], axis=1) @ matrix
-            column, row = ((clip[:, axis] / clip[:, 3] + 1) / 2 * (36, 24)[axis] for axis in (0, 1))
-            column, row = np.clip(column.astype(int), 0, 35), np.clip(row.astype(int), 0, 23)
-            near = np.linalg.norm(shown[row, column] - point[moved], axis=-1) < 0.2
-            alike = np.abs(seen[row, column] - read(moving, f"albedo{frame}")[moved]).max(axis=-1) < 1e-3
-            found[name] = near.mean(), alike.mean()
-        # Half a pixel aside there may be another texel, or the edge of the object.
-        assert found["previous"][0] > 0.85
-        assert found["previous"][1] > 0.4
-        assert found["position"][0] < 0.4
-        assert found["position"][1] < 0.5 * found["previous"][1]
 
 
 def test_history_follows_what_moves(moving: Path) -> None:

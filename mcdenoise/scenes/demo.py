@@ -14,7 +14,20 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import box, cylinder, diffuse, metal, plastic, rectangle, sphere, textured, tint, varnish
+from mcdenoise.scenes.parts import (
+    box,
+    cylinder,
+    diffuse,
+    disk,
+    lamp,
+    metal,
+    plastic,
+    rectangle,
+    sphere,
+    textured,
+    tint,
+    varnish,
+)
 from mcdenoise.scenes.random.builder import place, rotate
 
 
@@ -61,25 +74,16 @@ def _room() -> dict[str, Any]:
 
 
 def _lights() -> dict[str, Any]:
-    window = {
-        "type": "rectangle",
-        "to_world": place((-2.96, 1.6, -0.9), 0, (1.1, 0.8, 1), rotate("y", 90)),
-        "bsdf": diffuse((0, 0, 0)),
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10.5, 11.5, 13.0]}},
-    }
-    bulb = {
-        "type": "sphere",
-        "to_world": place((2.05, 1.62, -2.2), 0, (0.17, 0.17, 0.17)),
-        "bsdf": diffuse((0, 0, 0)),
-        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [21.0, 13.0, 6.5]}},
-    }
+    black = diffuse((0, 0, 0))
+    window = rectangle((-2.96, 1.6, -0.9), (1.1, 0.8), rotate("y", 90), black)
+    bulb = {"type": "sphere", "to_world": place((2.05, 1.62, -2.2), 0, (0.17, 0.17, 0.17)), "bsdf": black}
     frame = diffuse((0.7, 0.7, 0.68))
     return {
-        "window": window,
+        "window": lamp(window, (10.5, 11.5, 13.0)),
         "window_post": box((-2.93, 1.6, -0.9), (0.05, 1.7, 0.06), frame),
         "window_bar": box((-2.93, 1.6, -0.9), (0.05, 0.06, 2.3), frame),
         "window_sill": box((-2.9, 0.77, -0.9), (0.2, 0.05, 2.4), frame),
-        "lamp_bulb": bulb,
+        "lamp_bulb": lamp(bulb, (21.0, 13.0, 6.5)),
         "lamp_stand": cylinder((2.05, 0, -2.2), 1.46, 0.025, metal("Al", 0.15)),
         "lamp_foot": box((2.05, 0.02, -2.2), (0.3, 0.04, 0.3), metal("Al", 0.15)),
     }
@@ -90,14 +94,8 @@ def _shelf() -> dict[str, Any]:
     rng = np.random.default_rng(7)
     wood = diffuse((0.33, 0.2, 0.11))
     parts: dict[str, Any] = {}
-    palette = [
-        (0.6, 0.12, 0.08),
-        (0.1, 0.25, 0.42),
-        (0.75, 0.6, 0.25),
-        (0.12, 0.36, 0.25),
-        (0.7, 0.68, 0.6),
-        (0.3, 0.12, 0.3),
-    ]
+    red, blue, ochre = (0.6, 0.12, 0.08), (0.1, 0.25, 0.42), (0.75, 0.6, 0.25)
+    palette = [red, blue, ochre, (0.12, 0.36, 0.25), (0.7, 0.68, 0.6), (0.3, 0.12, 0.3)]
     for level, base in enumerate((1.1, 1.65)):
         parts[f"board_{level}"] = box((-1.35, base - 0.02, -2.83), (1.8, 0.04, 0.3), wood)
         left = -2.2
@@ -115,11 +113,7 @@ def _shelf() -> dict[str, Any]:
 
 def _still_life() -> dict[str, Any]:
     return {
-        "rug": {
-            "type": "disk",
-            "to_world": place((0.1, 0.012, -0.7), 0, (1.5, 1.5, 1), rotate("x", -90)),
-            "bsdf": textured(_rings()),
-        },
+        "rug": disk((0.1, 0.012, -0.7), 1.5, textured(_rings())),
         "plinth": box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), textured(_tiles()), turn=25),
         "glass_ball": sphere((0.75, 0.8, -1.25), 0.2, {"type": "dielectric", "int_ior": 1.5}),
         "copper_ball": sphere((-0.3, 0.47, -0.95), 0.46, metal("Cu", 0.18)),

@@ -60,8 +60,21 @@ class SequencePlan:
         out = self.out / f"random{number:04d}"
         if self.cycles:
             # What a place shows is not decided, because that needs Mitsuba.
-            take = next(self._draws(number))
-            folder = self._by_cycles(take, out, progress)
+            take, rendering = next(self._draws(number)), self.rendering
+            with Blender() as blender:
+                folder = render_cycles(
+                    take,
+                    out,
+                    blender,
+                    size=rendering["size"],
+                    seed=number,
+                    samples=rendering["spp"],
+                    noise_seeds=rendering["noise_seeds"],
+                    reference_samples=rendering["reference_spp"] if rendering["reference_frames"] != [] else 0,
+                    parts=self.parts,
+                    threads=self.threads,
+                    progress=progress,
+                )
         else:
             rendering = {**self.rendering, "variant": choose_variant(self.rendering["variant"])}
             take, tracer, _ = first_worth(
@@ -75,32 +88,12 @@ class SequencePlan:
             write_text(out / "credits.txt", "\n".join((*take.credits, "")))
         return folder
 
-    def _by_cycles(self, take: Take, out: Path, progress: Callable[[int, int], None] | None) -> Path:
-        rendering = self.rendering
-        with Blender() as blender:
-            return render_cycles(
-                take,
-                out,
-                blender,
-                size=rendering["size"],
-                seed=take.number,
-                samples=rendering["spp"],
-                noise_seeds=rendering["noise_seeds"],
-                reference_samples=rendering["reference_spp"] if rendering["reference_frames"] != [] else 0,
-                parts=self.parts,
-                threads=self.threads,
-                progress=progress,
-            )
-
     def _draws(self, number: int) -> Iterator[Take]:
         """Clips of the number's places, sampled once at pixel centres to see what they show."""
         width, height = (max(side, 1) for side in self.rendering["size"])
         size = (width, height) if self.cycles else (_PROBED, max(1, _PROBED * height // width))
+        assets = self.assets.part(self.unseen)
         for attempt in range(ATTEMPTS):
-            assets = self.assets.part(self.unseen)
             take = draw_take(number, assets, attempt, frames=self.frames, size=size, stills=False)
-            yield (
-                take
-                if self.cycles
-                else replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
-            )
+            plain = replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
+            yield take if self.cycles else plain

@@ -14,7 +14,20 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import box, cylinder, diffuse, metal, plastic, rectangle, sphere, textured, tint, varnish
+from mcdenoise.scenes.parts import (
+    box,
+    cylinder,
+    diffuse,
+    disk,
+    lamp,
+    metal,
+    plastic,
+    rectangle,
+    sphere,
+    textured,
+    tint,
+    varnish,
+)
 from mcdenoise.scenes.random.builder import place, rotate
 from mcdenoise.scenes.random.textures import Color
 
@@ -82,17 +95,16 @@ def _room() -> dict[str, Any]:
 
 def _lights() -> dict[str, Any]:
     """A window and a lamp behind the camera, which are reflected in mirror and table, and a visible lamp."""
+    black = diffuse((0, 0, 0))
+    window = rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate("y", 180), black)
     return {
-        "window": {
-            **rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate("y", 180), diffuse((0, 0, 0))),
-            "emitter": _area((13.0, 14.5, 16.5)),
-        },
+        "window": lamp(window, (13.0, 14.5, 16.5)),
         "window_post": box((-2.1, 1.65, 3.93), (0.05, 1.5, 0.05), diffuse((0.7, 0.7, 0.68))),
         "window_bar": box((-2.1, 1.65, 3.93), (1.4, 0.05, 0.05), diffuse((0.7, 0.7, 0.68))),
-        "lamp_behind": {**sphere((-1.3, 1.8, 0.7), 0.1, diffuse((0, 0, 0))), "emitter": _area((26.0, 16.0, 7.5))},
-        "lamp": {**sphere((0.2, 1.28, -2.0), 0.075, diffuse((0, 0, 0))), "emitter": _area((42.0, 27.0, 13.0))},
+        "lamp_behind": lamp(sphere((-1.3, 1.8, 0.7), 0.1, black), (26.0, 16.0, 7.5)),
+        "lamp": lamp(sphere((0.2, 1.28, -2.0), 0.075, black), (42.0, 27.0, 13.0)),
         "lamp_stand": cylinder((0.2, _TABLE, -2.0), 0.48, 0.012, metal("Al", 0.1)),
-        "spot": {**sphere((1.5, 2.3, -0.4), 0.05, diffuse((0, 0, 0))), "emitter": _area((75.0, 66.0, 50.0))},
+        "spot": lamp(sphere((1.5, 2.3, -0.4), 0.05, black), (75.0, 66.0, 50.0)),
     }
 
 
@@ -143,16 +155,8 @@ def _solid(name: str, foot: Color, height: float, radius: float, bsdf: dict[str,
     x, y, z = foot
     return {
         f"{name}_side": cylinder(foot, height, radius, bsdf),
-        f"{name}_foot": {
-            "type": "disk",
-            "to_world": place(foot, 0, (radius, radius, 1), rotate("x", 90)),
-            "bsdf": bsdf,
-        },
-        f"{name}_top": {
-            "type": "disk",
-            "to_world": place((x, y + height, z), 0, (radius, radius, 1), rotate("x", -90)),
-            "bsdf": bsdf,
-        },
+        f"{name}_foot": disk(foot, radius, bsdf, up=False),
+        f"{name}_top": disk((x, y + height, z), radius, bsdf),
     }
 
 
@@ -193,10 +197,6 @@ def _rods() -> dict[str, Any]:
         "bsdf": diffuse((0.8, 0.78, 0.7)),
     }
     return rods
-
-
-def _area(radiance: Color) -> dict[str, Any]:
-    return {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}}
 
 
 def _dark_wood() -> Array:

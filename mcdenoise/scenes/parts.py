@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import place
+from mcdenoise.scenes.random.builder import place, rotate
 from mcdenoise.scenes.random.textures import Color
 
 
@@ -18,15 +18,12 @@ def tint(brightness: Array, color: Color) -> Array:
 
 def textured(texture: Array) -> dict[str, Any]:
     """A diffuse surface with a texture."""
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap(texture)}}
+    return _two_sided({"type": "diffuse", "reflectance": bitmap(texture)})
 
 
 def varnish(texture: Array, alpha: float = 0.15) -> dict[str, Any]:
     """A diffuse surface under a slightly rough coat."""
-    return {
-        "type": "twosided",
-        "bsdf": {"type": "roughplastic", "diffuse_reflectance": bitmap(texture), "alpha": alpha},
-    }
+    return _two_sided({"type": "roughplastic", "diffuse_reflectance": bitmap(texture), "alpha": alpha})
 
 
 def bitmap(texture: Array) -> dict[str, Any]:
@@ -37,18 +34,18 @@ def bitmap(texture: Array) -> dict[str, Any]:
 
 def diffuse(color: Color) -> dict[str, Any]:
     """A diffuse surface."""
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}}
+    return _two_sided({"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}})
 
 
 def plastic(color: Color, alpha: float) -> dict[str, Any]:
     """A diffuse surface under a rough coat."""
     reflectance = {"type": "rgb", "value": list(color)}
-    return {"type": "twosided", "bsdf": {"type": "roughplastic", "diffuse_reflectance": reflectance, "alpha": alpha}}
+    return _two_sided({"type": "roughplastic", "diffuse_reflectance": reflectance, "alpha": alpha})
 
 
 def metal(material: str, alpha: float) -> dict[str, Any]:
     """A rough metal."""
-    return {"type": "twosided", "bsdf": {"type": "roughconductor", "material": material, "alpha": alpha}}
+    return _two_sided({"type": "roughconductor", "material": material, "alpha": alpha})
 
 
 def rectangle(center: Color, half_size: tuple[float, float], rotation: Array, bsdf: dict[str, Any]) -> dict[str, Any]:
@@ -62,6 +59,17 @@ def box(center: Color, size: Color, bsdf: dict[str, Any], turn: float = 0) -> di
     return {"type": "cube", "to_world": place(center, turn, half), "bsdf": bsdf}
 
 
+def disk(center: Color, radius: float, bsdf: dict[str, Any], up: bool = True) -> dict[str, Any]:
+    """A horizontal disk that faces up, or down."""
+    to_world = place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90))
+    return {"type": "disk", "to_world": to_world, "bsdf": bsdf}
+
+
+def lamp(shape: dict[str, Any], radiance: Color) -> dict[str, Any]:
+    """A shape that sends out light."""
+    return {**shape, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(radiance)}}}
+
+
 def sphere(center: Color, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
     """A sphere."""
     return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf}
@@ -71,3 +79,7 @@ def cylinder(foot: Color, height: float, radius: float, bsdf: dict[str, Any]) ->
     """The side of an upright cylinder, without caps."""
     top = [foot[0], foot[1] + height, foot[2]]
     return {"type": "cylinder", "p0": list(foot), "p1": top, "radius": radius, "bsdf": bsdf}
+
+
+def _two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "twosided", "bsdf": bsdf}

@@ -6,7 +6,7 @@ import functools
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,7 @@ import pytest
 
 from mcdenoise.data.camera_path import Camera, check_moves, pixel_rays
 from mcdenoise.scenes.assets import Assets
-from mcdenoise.scenes.random import cameras
-from mcdenoise.scenes.random.builder import SceneBuilder, bounds, box
-from mcdenoise.scenes.random.materials import diffuse
+from mcdenoise.scenes.random.builder import bounds
 from mcdenoise.scenes.render.loading import scene_digest
 from mcdenoise.scenes.render.tracer import Tracer
 from mcdenoise.scenes.takes.draw import Take, draw_take
@@ -162,28 +160,6 @@ def test_cameras_are_outside_the_boxes_of_all_shapes() -> None:
         for camera in made.cameras:
             eye = camera.to_world[:3, 3]
             assert not ((eye > boxes[:, 0] - CLOSE) & (eye < boxes[:, 1] + CLOSE)).all(axis=-1).any(), seed
-
-
-def test_every_frame_of_a_path_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Among pillars, on a way that leads aside and jumps back to where it started every eight frames."""
-
-    def way(start: cameras._View, rng: np.random.Generator) -> Callable[[cameras._View, int], cameras._View]:
-        aside = np.array((0.3, 0, 0.2))
-        return lambda view, frame: replace(view, origin=view.origin + frame % 8 * aside)
-
-    monkeypatch.setattr(cameras, "_way_to_move", way)
-    builder = SceneBuilder((-6, 0, -6), (6, 3, 6))
-    gray = builder.material(diffuse((0.5, 0.5, 0.5)))
-    builder.add(box((x, 1.5, z), (0.3, 3, 0.3), gray) for x in range(-6, 7, 2) for z in range(-6, 7, 2))
-    builder.points.append(np.array((0, 1, 0)))
-    lows, highs = builder.boxes()
-    moving = 0
-    for seed in range(10):
-        shot = cameras.shoot(builder, np.random.default_rng(seed), 17)
-        eyes = np.array([camera.to_world[:3, 3] for camera in shot])[:, None]
-        assert not ((eyes > lows - CLOSE) & (eyes < highs + CLOSE)).all(axis=-1).any(), seed
-        moving += bool((eyes[0] != eyes[1]).any())
-    assert moving > 3
 
 
 # The scenes in Mitsuba

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,42 +22,22 @@ from mcdenoise.scenes.random.textures import picture, random_color
 
 Rng = np.random.Generator
 Ref = dict[str, str]
+# Parts, radius, and the height of the top, 0 without one.
+Piece: TypeAlias = tuple[list[Part], float, float]
 
 
 def ornament(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     """A small object of about ``size`` metres to put on a table."""
-    makers: list[Callable[[SceneBuilder, Rng, float], list[Part]]] = [
-        _ball,
-        _ball,
-        _block,
-        _can,
-        _goblet,
-        _ring,
-        _heap,
-        _urchin,
-        _book_pile,
-        _stack,
-        _plant,
-    ]
-    return makers[int(rng.integers(len(makers)))](builder, rng, size)
+    ornaments = _ball, _ball, _block, _can, _goblet, _ring, _heap, _urchin, _book_pile, _stack, _plant
+    return ornaments[int(rng.integers(len(ornaments)))](builder, rng, size)
 
 
-def furniture(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def furniture(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     """A piece of furniture for a room of that height, its radius, and the height of its top (0 if it has none)."""
-    makers: list[Callable[[SceneBuilder, Rng, float], tuple[list[Part], float, float]]] = [
-        _table,
-        _table,
-        _chair,
-        _chair,
-        _shelf,
-        _sofa,
-        _stairs,
-        _screen,
-        _crates,
-        _big_plant,
-        _pedestal,
-        _railing,
-    ]
+    makers: tuple[Callable[[SceneBuilder, Rng, float], Piece], ...] = (
+        *(_table, _table, _chair, _chair, _shelf, _sofa, _stairs),
+        *(_screen, _crates, _big_plant, _pedestal, _railing),
+    )
     return makers[int(rng.integers(len(makers)))](builder, rng, height)
 
 
@@ -218,20 +199,13 @@ def _plant(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     return parts
 
 
-def _table(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _table(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     top, legs = builder.material(random_opaque(rng, textured=0.6)), _any_opaque(builder, rng)
     height, thick = rng.uniform(0.4, 0.95), rng.uniform(0.02, 0.07)
     if rng.random() < 0.35:
         radius = rng.uniform(0.3, 0.8)
-        return (
-            [
-                *drum((0, height - thick, 0), thick, radius, top),
-                rod((0, 0, 0), (0, height, 0), 0.05, legs),
-                plate((0, 0.01, 0), 0.5 * radius, legs),
-            ],
-            radius,
-            height,
-        )
+        plinth = [rod((0, 0, 0), (0, height, 0), 0.05, legs), plate((0, 0.01, 0), 0.5 * radius, legs)]
+        return [*drum((0, height - thick, 0), thick, radius, top), *plinth], radius, height
     width, depth = rng.uniform(0.6, 1.8), rng.uniform(0.5, 1.0)
     parts = [box((0, height - thick / 2, 0), (width, thick, depth), top)]
     leg = rng.uniform(0.02, 0.08)
@@ -242,7 +216,7 @@ def _table(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float
     return parts, math.hypot(width, depth) / 2, height
 
 
-def _chair(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _chair(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     wood, seat = _any_opaque(builder, rng), _any_opaque(builder, rng)
     back = rng.uniform(0.8, 1.15)
     parts = [box((0, 0.45, 0), (0.44, 0.04, 0.44), seat)]
@@ -258,7 +232,7 @@ def _chair(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float
     return parts, 0.35, 0.0
 
 
-def _shelf(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _shelf(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     """Shelves with books and jars, open towards +z."""
     wood = builder.material(random_opaque(rng, textured=0.5))
     width, depth, boards = rng.uniform(0.7, 1.4), rng.uniform(0.22, 0.35), int(rng.integers(2, 5))
@@ -284,7 +258,7 @@ def _shelf(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], 
     return parts, 0.5 * width, 0.0
 
 
-def _sofa(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _sofa(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     cloth = builder.material(random_opaque(rng, (3, 3)))
     width = rng.uniform(0.8, 2.0)
     parts = [
@@ -300,7 +274,7 @@ def _sofa(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float,
     return parts, math.hypot(width, 0.8) / 2, 0.0
 
 
-def _stairs(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _stairs(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     stone, rail = _any_opaque(builder, rng), _any_opaque(builder, rng)
     steps, width = int(rng.integers(4, 10)), rng.uniform(0.6, 1.2)
     rise, tread = min(0.18, (height - 0.5) / steps), 0.26
@@ -314,7 +288,7 @@ def _stairs(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part],
     return parts, steps * tread / 2 + 0.2, 0.0
 
 
-def _screen(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _screen(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     """A folding screen: closed panels or slats."""
     material = builder.material(random_opaque(rng, textured=0.6))
     tall, panels, slope = min(rng.uniform(1.0, 1.9), height - 0.4), int(rng.integers(2, 5)), rng.uniform(20, 60)
@@ -331,7 +305,7 @@ def _screen(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part],
     return parts, 0.25 * panels + 0.1, 0.0
 
 
-def _crates(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _crates(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     parts: list[Part] = []
     for _crate in range(int(rng.integers(1, 5))):
         edge = rng.uniform(0.2, 0.6)
@@ -342,12 +316,12 @@ def _crates(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], floa
     return parts, 0.6, 0.0
 
 
-def _big_plant(builder: SceneBuilder, rng: Rng, height: float) -> tuple[list[Part], float, float]:
+def _big_plant(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     size = min(rng.uniform(0.8, 1.7), height - 0.6)
     return _plant(builder, rng, size), 0.3 * size, 0.0
 
 
-def _pedestal(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _pedestal(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     height, radius = rng.uniform(0.3, 1.1), rng.uniform(0.2, 0.4)
     material = builder.material(random_opaque(rng, textured=0.6))
     if rng.random() < 0.5:
@@ -355,7 +329,7 @@ def _pedestal(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], fl
     return [box((0, height / 2, 0), (1.4 * radius, height, 1.4 * radius), material)], radius, height
 
 
-def _railing(builder: SceneBuilder, rng: Rng, _: float) -> tuple[list[Part], float, float]:
+def _railing(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     material, length = builder.material(random_metal(rng) if rng.random() < 0.3 else random_opaque(rng)), 1.6
     bars = int(rng.integers(8, 24))
     parts = [rod((x, 0, 0), (x, 1, 0), 0.01, material) for x in np.linspace(-length / 2, length / 2, bars)]

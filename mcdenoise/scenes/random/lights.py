@@ -13,6 +13,7 @@ from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaq
 from mcdenoise.scenes.random.textures import Color
 
 Rng = np.random.Generator
+Point = tuple[float, float, float]
 _SKY_ROWS = 128
 
 
@@ -170,23 +171,23 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     builder.add([sheet(origin, half_size, black, rotation, radiance)])
 
 
-def _panel(
-    builder: SceneBuilder,
-    center: tuple[float, float, float],
-    half_size: tuple[float, float],
-    power: float,
-    color: Color,
-) -> None:
+def _glowing(
+    builder: SceneBuilder, center: Point, half_size: tuple[float, float], power: float, color: Color, degrees: float
+) -> dict[str, str]:
+    """Add a white sheet that sends out a power, and return its material."""
     white = builder.material(diffuse((0.8, 0.8, 0.8)))
     radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
-    builder.add([sheet(center, half_size, white, rotate("x", 90), radiance)])
+    builder.add([sheet(center, half_size, white, rotate("x", degrees), radiance)])
+    return white
+
+
+def _panel(builder: SceneBuilder, center: Point, half_size: tuple[float, float], power: float, color: Color) -> None:
+    white = _glowing(builder, center, half_size, power, color, 90)
     frame = (center[0], center[1] + 0.012, center[2])
     builder.add([box(frame, (2 * half_size[0] + 0.06, 0.02, 2 * half_size[1] + 0.06), white)])
 
 
-def _pendant(
-    builder: SceneBuilder, rng: Rng, hook: tuple[float, float, float], height: float, power: float, color: Color
-) -> None:
+def _pendant(builder: SceneBuilder, rng: Rng, hook: Point, height: float, power: float, color: Color) -> None:
     """A bulb on a cord, bare or under a shade that blocks the light to the ceiling."""
     radius = float(np.exp(rng.uniform(math.log(0.02), math.log(0.2))))
     y = hook[1] - float(rng.uniform(0.15, 0.45)) * height
@@ -198,17 +199,11 @@ def _pendant(
     if rng.random() < 0.4:
         shade = builder.material(random_opaque(rng))
         wide = radius * float(rng.uniform(1.3, 2.5))
-        builder.add(
-            [
-                rod((hook[0], y - radius, hook[2]), (hook[0], y + 1.5 * radius, hook[2]), wide, shade),
-                plate((hook[0], y + 1.5 * radius, hook[2]), wide, shade),
-            ]
-        )
+        top = (hook[0], y + 1.5 * radius, hook[2])
+        builder.add([rod((hook[0], y - radius, hook[2]), top, wide, shade), plate(top, wide, shade)])
 
 
-def _standing(
-    builder: SceneBuilder, rng: Rng, foot: tuple[float, float, float], height: float, power: float, color: Color
-) -> None:
+def _standing(builder: SceneBuilder, rng: Rng, foot: Point, height: float, power: float, color: Color) -> None:
     metal = builder.material(random_metal(rng))
     x, y, z = foot
     top = float(rng.uniform(0.35, 0.7)) * height
@@ -223,20 +218,17 @@ def _standing(
 
 def _cove(builder: SceneBuilder, rng: Rng, low: Array, high: Array, power: float, color: Color) -> None:
     """A light strip behind a board under the ceiling, so that everything below is lit indirectly."""
-    white = builder.material(diffuse((0.8, 0.8, 0.8)))
     side = int(rng.choice([-1, 1]))
     x = float(low[0] if side < 0 else high[0]) - side * 0.12
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
     length = 0.85 * float(high[2] - low[2])
-    half_size = (0.04, length / 2)
-    radiance = _scaled(color, 1.5 * power / (math.pi * 4 * half_size[0] * half_size[1]))
-    builder.add([sheet((x, y + 0.03, z), half_size, white, rotate("x", -90), radiance)])
+    white = _glowing(builder, (x, y + 0.03, z), (0.04, length / 2), 1.5 * power, color, -90)
     builder.add(
         [box((x, y, z), (0.2, 0.03, length), white), box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)]
     )
 
 
-def _chandelier(builder: SceneBuilder, rng: Rng, hook: tuple[float, float, float], power: float, color: Color) -> None:
+def _chandelier(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color) -> None:
     metal = builder.material(random_metal(rng))
     bulbs, radius = 3, float(rng.uniform(0.2, 0.5))
     y = hook[1] - float(rng.uniform(0.4, 0.8))
@@ -249,9 +241,7 @@ def _chandelier(builder: SceneBuilder, rng: Rng, hook: tuple[float, float, float
     builder.points.append(np.array((hook[0], y, hook[2])))
 
 
-def _bulb(
-    center: tuple[float, float, float], radius: float, material: dict[str, str], power: float, color: Color
-) -> Part:
+def _bulb(center: Point, radius: float, material: dict[str, str], power: float, color: Color) -> Part:
     return ball(center, radius, material, _scaled(color, power / (4 * math.pi**2 * radius**2)))
 
 

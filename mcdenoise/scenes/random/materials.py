@@ -26,14 +26,11 @@ def diffuse(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) ->
     return _two_sided({"type": "diffuse", "reflectance": _bitmap(reflectance, repeat)})
 
 
-def plastic(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
-    """A diffuse surface under a smooth clear coat."""
-    return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)})
-
-
-def lacquer(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1), nonlinear: bool = True) -> Bsdf:
+def lacquer(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1), nonlinear: bool | None = None) -> Bsdf:
     """A diffuse surface under a smooth clear coat; ``nonlinear`` saturates the color by internal reflections."""
-    return _two_sided({"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "nonlinear": nonlinear})
+    inner = {"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)}
+    # By default Mitsuba's plastic is linear; a key would change the checksums of scenes.
+    return _two_sided(inner if nonlinear is None else {**inner, "nonlinear": nonlinear})
 
 
 def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
@@ -44,14 +41,8 @@ def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float,
 def rough_metal(material: str, alpha: float | Array, tint: Color | Array = (1, 1, 1)) -> Bsdf:
     """A rough metal; ``alpha`` may be a ``(H, W, 1)`` texture."""
     roughness = np.full((2, 2, 1), alpha) if isinstance(alpha, float) else alpha
-    return _two_sided(
-        {
-            "type": "roughconductor",
-            "material": material,
-            "alpha": _bitmap(roughness),
-            "specular_reflectance": _bitmap(tint),
-        }
-    )
+    rough = {"type": "roughconductor", "material": material, "alpha": _bitmap(roughness)}
+    return _two_sided({**rough, "specular_reflectance": _bitmap(tint)})
 
 
 def mirror(material: str = "Ag") -> Bsdf:
@@ -93,7 +84,7 @@ def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1)
     if kind < 0.55:
         return diffuse(look, repeat)
     if kind < 0.7:
-        return plastic(look, repeat)
+        return lacquer(look, repeat)
     return rough_plastic(look, float(np.exp(rng.uniform(np.log(0.03), np.log(0.4)))), repeat)
 
 

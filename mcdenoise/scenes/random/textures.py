@@ -43,20 +43,8 @@ def wall_color(rng: np.random.Generator) -> Color:
 
 def texture(rng: np.random.Generator) -> Array:
     """A random pattern in random colours and at a random scale."""
-    patterns: list[Callable[[np.random.Generator], Array]] = [
-        checker,
-        tiles,
-        tiles,
-        planks,
-        planks,
-        stripes,
-        dots,
-        marble,
-        marble,
-        wallpaper,
-        glyphs,
-        picture,
-    ]
+    plain: tuple[Callable[[np.random.Generator], Array], ...] = (checker, tiles, tiles, planks, planks, stripes, dots)
+    patterns = (*plain, marble, marble, wallpaper, glyphs, picture)
     return patterns[int(rng.integers(len(patterns)))](rng)
 
 

@@ -121,7 +121,7 @@ class SequenceFolder:
         self._description = self.path / "camera.json"
         before = self._read(settings) if self._description.is_file() else {}
         self._settings = {**_merged(before, settings), **_ALWAYS, **conventions}
-        self.references = self._find_references(before.get("reference_spp", {}))
+        self.references = self._find_references()
         self._write()
         matrices = CameraMatrices(
             np.array(self._settings["camera_matrices"]),
@@ -144,32 +144,30 @@ class SequenceFolder:
         described = self._description
         try:
             before: dict[str, Any] = json.loads(read_text(described))
-            before["reference_spp"] = {int(number): int(spp) for number, spp in before["reference_spp"].items()}
-            poses = list(zip(*(before[key] for key in _POSES), strict=True))
-            before["frames"] = int(before["frames"])
-            moves = {identity: list(matrices) for identity, matrices in before.get("moves", {}).items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            moves = {identity: list(path) for identity, path in before.get("moves", {}).items()}
+            common = min(int(before["frames"]), settings["frames"])
+            paths = {key: [before[key][number] for number in range(common)] for key in _POSES}
+        except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
             if before.get(key) != settings.get(key):
                 found = f"rendered with {key} {before.get(key)}, now {settings.get(key)}"
                 raise InputError(f"{described}: {found}; {_ADVICE}")
-        for number, pose in enumerate(zip(*(settings[key] for key in _POSES), strict=True)):
-            if number < len(poses) and pose != poses[number]:
-                raise InputError(f"{described}: frame {number} was rendered from another camera; {_ADVICE}")
         now = settings.get("moves", {})
         if moves.keys() != now.keys():
             names = (", ".join(sorted(ids)) or "nothing" for ids in (moves, now))
             raise InputError(f"{described}: rendered with {next(names)} moving, now {next(names)}; {_ADVICE}")
-        for identity, matrices in moves.items():
-            for number, pair in enumerate(zip(matrices, now[identity], strict=False)):
-                if pair[0] != pair[1]:
+        for number in range(common):
+            if any(path[number] != settings[key][number] for key, path in paths.items()):
+                raise InputError(f"{described}: frame {number} was rendered from another camera; {_ADVICE}")
+            for identity, path in moves.items():
+                if path[number : number + 1] != now[identity][number : number + 1]:
                     raise InputError(
                         f"{described}: object '{identity}' was elsewhere when frame {number} was rendered; {_ADVICE}"
                     )
         return before
 
-    def _find_references(self, known_spp: dict[int, int]) -> dict[int, ReferenceState]:
+    def _find_references(self) -> dict[int, ReferenceState]:
         """Read the states of references from their headers, which are written together with the pixels."""
         found: dict[int, ReferenceState] = {}
         for number in range(self._settings["frames"]):
@@ -179,9 +177,6 @@ class SequenceFolder:
                 continue
             header = read_image_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
-            if spp is None and number in known_spp:
-                # Older versions wrote no number of passes: there cannot be more passes than paths.
-                spp = passes = known_spp[number]
             if not isinstance(spp, int) or not isinstance(passes, int):
                 raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
             found[number] = ReferenceState(spp, passes, noise if isinstance(noise, float) else None)

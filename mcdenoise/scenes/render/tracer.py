@@ -181,24 +181,19 @@ class Tracer:
 
     def _placement(self, identity: str, shapes: Mapping[str, Any]) -> dict[str, tuple[Any, Array]]:
         """The parameters to change when an object moves, with their types and initial values."""
-        emitters = {emitter.id() for emitter in self.scene.emitters()}
-        present = [
-            key for key in ("to_world", "vertex_positions", "position") if f"{identity}.{key}" in self._parameters
-        ]
-        if identity not in emitters.union(shapes) or not present:
-            everything = self._parameters.keys()
-            names = sorted(
-                key.rpartition(".")[0]
-                for key in everything
-                if key.endswith((".to_world", ".vertex_positions", ".position"))
-                and key.rpartition(".")[0] in emitters.union(shapes)
-            )
+        things = {emitter.id() for emitter in self.scene.emitters()}.union(shapes)
+        kinds = ("to_world", "vertex_positions", "position")
+        movable = {
+            name: [kind for kind in kinds if f"{name}.{kind}" in self._parameters][:1] for name in sorted(things)
+        }
+        if not movable.get(identity):
+            names = [name for name, keys in movable.items() if keys]
             more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
             raise InputError(
                 f"object '{identity}': expected the id of a shape or a light that can move "
                 f"({', '.join(names[:_MOST_NAMES])}{more}), found no such thing in the scene"
             )
-        keys = present[:1]
+        keys = movable[identity]
         if keys == ["vertex_positions"] and f"{identity}.vertex_normals" in self._parameters:
             keys.append("vertex_normals")
         placement = {}
@@ -211,33 +206,32 @@ class Tracer:
     def _scalar_rays(self, rays: PixelRays) -> list[Any]:
         # Cached for the next pass, because creating them takes as long as tracing them once.
         if self._last_rays is None or self._last_rays[0] is not rays:
-            self._last_rays = (rays, self._make_scalar_rays(rays))
+            mi, origin = self.mitsuba, self.mitsuba.Point3f(*rays.origin.tolist())
+            ways = rays.directions.tolist()
+            made = [mi.RayDifferential3f(mi.Ray3f(origin, mi.Vector3f(*way))) for way in ways]
+            self._last_rays = (rays, made)
         return self._last_rays[1]
 
-    def _make_scalar_rays(self, rays: PixelRays) -> list[Any]:
-        origin = self.mitsuba.Point3f(*rays.origin.tolist())
-        return [
-            self.mitsuba.RayDifferential3f(self.mitsuba.Ray3f(origin, self.mitsuba.Vector3f(*direction)))
-            for direction in rays.directions.tolist()
-        ]
-
     def _scalar_radiance(self, rays: list[Any], paths: int, sampler: Any, state: int, stratified: bool) -> Array:
-        sample, scene = self.path.sample, self.scene
         values: list[float] = []
+
+        def trace(ray: Any) -> None:
+            values.extend(self.path.sample(self.scene, sampler, ray)[0])
+
         if stratified:
             for index, ray in enumerate(rays):
                 sampler.seed((state + index) % 2**32, 1)
                 for _ in range(paths):
-                    values.extend(sample(scene, sampler, ray)[0])
+                    trace(ray)
                     sampler.advance()
-            samples = np.array(values, dtype=np.float32).reshape(len(rays), paths, 3).swapaxes(0, 1)
         else:
             sampler.seed(state, 1)
             for _ in range(paths):
                 for ray in rays:
-                    values.extend(sample(scene, sampler, ray)[0])
-            samples = np.array(values, dtype=np.float32).reshape(paths, len(rays), 3)
-        return np.asarray(_finite(samples).sum(axis=0, dtype=np.float64) / paths)
+                    trace(ray)
+        shape = (len(rays), paths, 3) if stratified else (paths, len(rays), 3)
+        samples = _finite(np.array(values, dtype=np.float32).reshape(shape))
+        return np.asarray(samples.sum(axis=1 if stratified else 0, dtype=np.float64) / paths)
 
     def _wavefront(self, rays: PixelRays, copies: int, interleaved: bool = True) -> Any:
         mi = self.mitsuba

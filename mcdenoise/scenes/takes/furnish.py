@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -44,41 +45,27 @@ class Stock:
         """One of these models, or none where there is none, or where the scene is full."""
         return None if not choices or self.triangles > _ENOUGH else choices[int(rng.integers(len(choices)))]
 
+    def _things(self, keep: Callable[[Model], bool]) -> list[Model]:
+        return [model for model in self.assets.models if not model.opening and keep(model)]
+
     def small(self) -> list[Model]:
         """Things that stand on tables."""
-        return [
-            model
-            for model in self.assets.models
-            if _LEAST < max(model.size) < _SMALL and model.elevation == 0 and not model.opening
-        ]
+        return self._things(lambda model: _LEAST < max(model.size) < _SMALL and model.elevation == 0)
 
     def pieces(self, theme: str, largest: Array) -> list[Model]:
         """Things that stand on the floor of a room of a size."""
-        return [
-            model
-            for model in self.assets.models
-            if model.category in (theme, "Miscellaneous", "Lights")
-            and max(model.size) > 0.35
-            and model.elevation < 0.1
-            and not model.opening
-            and (np.array(model.size) < largest).all()
-        ]
+        kinds = (theme, "Miscellaneous", "Lights")
+        found = self._things(lambda model: model.category in kinds and model.elevation < 0.1)
+        return [model for model in found if max(model.size) > 0.35 and (np.array(model.size) < largest).all()]
 
     def hung(self, theme: str) -> list[Model]:
         """Things that hang on a wall."""
-        return [
-            model
-            for model in self.assets.models
-            if model.category in (theme, "Miscellaneous") and 0.5 < model.elevation < 2 and not model.opening
-        ]
+        return self._things(lambda model: model.category in (theme, "Miscellaneous") and 0.5 < model.elevation < 2)
 
     def outside(self) -> list[Model]:
         """Things that stand on the ground outdoors."""
-        return [
-            model
-            for model in self.assets.models
-            if model.category in _OUTDOORS and model.elevation < 0.1 and not model.opening and max(model.size) < 9
-        ]
+        found = self._things(lambda model: model.category in _OUTDOORS and model.elevation < 0.1)
+        return [model for model in found if max(model.size) < 9]
 
     def normal_map(self, rng: Rng) -> Array | None:
         """A normal map, ``(H, W, 3)``."""
