@@ -44,12 +44,7 @@ class FromBuffers(nn.Module):
         if not required | optional or "frame" in required:
             raise InputError(f"model: {CONTRACT}; found {name_of_object(function)}{inspect.signature(call)}")
         trainable = isinstance(function, nn.Module) and any(True for _ in function.parameters())
-        self._needs = Needs(frozenset(required), frozenset(optional), trainable, reach)
-
-    @property
-    def needs(self) -> Needs:
-        """The buffers that the function takes."""
-        return self._needs
+        self.needs = Needs(frozenset(required), frozenset(optional), trainable, reach)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`.
@@ -57,12 +52,12 @@ class FromBuffers(nn.Module):
         Raises:
             MissingBufferError: the frame lacks a buffer that the function takes.
         """
-        if absent := self._needs.missing(frame):
+        if absent := self.needs.missing(frame):
             raise MissingBufferError(
                 f"buffer '{absent[0]}': {name_of_object(self.function)} takes it, found only "
                 f"{', '.join(sorted(frame.buffers))}; render it, or give that argument a default value"
             )
-        named = {name: frame.buffer(name) for name in sorted(self._needs.buffers | self._needs.uses)}
+        named = {name: frame.buffer(name) for name in sorted(self.needs.buffers | self.needs.uses)}
         result = self.function(**{name: image for name, image in named.items() if image is not None})
         if isinstance(result, Output):
             return result, None

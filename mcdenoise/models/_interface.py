@@ -73,6 +73,8 @@ class Output(NamedTuple):
         return self._replace(notes=(*notes, *self.notes))
 
 
+# The usual features of a frame.
+GUIDES = frozenset({"albedo", "normal", "depth"})
 # Some 64 feature channels and the images around them.
 _DEFAULT = Live(0, 64 + 54)
 

@@ -101,11 +101,11 @@ def check_odd(kernel_size: int) -> None:
         raise InputError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
 
 
-class TenChannels(nn.Module):
-    """Base of networks whose input is an image and seven feature channels in [0, 1]."""
+class Network(nn.Module):
+    """Base of the zoo's networks: what the whole image tells, and the features in [0, 1]."""
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
+        """Exposure and depth scale of the whole image."""
         return image_statistics(frame)
 
     def features(self, frame: Frame) -> list[Tensor]:

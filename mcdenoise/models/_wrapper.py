@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor, nn
@@ -25,6 +26,10 @@ class Wrapper(nn.Module):
     inner: Model
     # Under which name the report has the run time of what a wrapper does itself.
     stage: ClassVar[str] = "network"
+    # Buffers that it uses itself, those that it makes for the method inside, and whether it looks at the whole image.
+    takes: ClassVar[frozenset[str]] = frozenset()
+    gives: ClassVar[frozenset[str]] = frozenset()
+    whole: ClassVar[bool] = False
 
     def __init__(self, inner: Model) -> None:
         super().__init__()
@@ -32,8 +37,10 @@ class Wrapper(nn.Module):
 
     @property
     def needs(self) -> Needs:
-        """The needs of the inner model."""
-        return self.inner.needs
+        """The needs of the inner model, but for the buffers made here, and what the wrapper uses itself."""
+        needs = self.inner.needs
+        uses, reach = (needs.uses - self.gives) | self.takes, None if self.whole else needs.reach
+        return replace(needs, buffers=needs.buffers - self.gives, uses=uses, reach=reach)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The statistics of the inner model, see :class:`mcdenoise.models.Model`."""

@@ -13,7 +13,7 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, with_light
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._motion import comparable, is_still, motion_unless_still, surface_before
 from mcdenoise.models._reads import at_hand
@@ -176,6 +176,10 @@ class Accumulated(Wrapper):
         InputError: a setting is out of its range.
     """
 
+    stage, whole = "accumulate", True
+    takes = MOTION | GUIDES | {"view_projection"}
+    gives = frozenset({"current", "length"})
+
     def __init__(
         self,
         inner: Model,
@@ -195,24 +199,10 @@ class Accumulated(Wrapper):
         if not specular_length >= 0:
             raise InputError(f"specular_length: expected at least 0, found {specular_length}")
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
+        self.persistence = 1 - alpha_min
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
         self.also = tuple(also)
-
-    stage = "accumulate"
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the method inside, except for the buffers made here; buffers that tell motion are of use."""
-        needs = self.inner.needs
-        given = frozenset({"current", "length"})
-        uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth", "albedo"}
-        return Needs(needs.buffers - given, uses, needs.trainable, None)
-
-    @property
-    def persistence(self) -> float:
-        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
-        return 1 - self.alpha_min
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """None: those of the method inside are of the accumulated radiance."""

@@ -32,18 +32,17 @@ The authors' loss is SMAPE plus 0.25 times SMAPE of frame differences (``tempora
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import Network
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import from_before, to_be_kept
-from mcdenoise.nn.inputs import features_of, image_statistics
+from mcdenoise.nn.inputs import features_of
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import affinity_filter
@@ -54,12 +53,15 @@ _OF_FILTER = FEATURES + 2  # a and c
 _SAMPLE = 10  # radiance 3, albedo 3, normal 3, depth 1
 
 
-class Anf(nn.Module):
+class Anf(Network):
     """The method, for demodulated radiance.
 
     Args:
         width: channels of the embedding, the paper's 32, and of the U-Net.
     """
+
+    needs = Needs(uses=MOTION | GUIDES | {"samples", "view_projection"})
+    persistence = None  # the network learns what to remember
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
@@ -77,19 +79,6 @@ class Anf(nn.Module):
             # Bandwidths start at about 1, because a square has no slope at 0.
             self.head.bias[FEATURES::_OF_FILTER] = 1.0  # type: ignore[index]
             self.head.bias[-1] = 1.0  # type: ignore[index]
-
-    @property
-    def persistence(self) -> None:
-        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses features, samples and motion."""
-        return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Exposure and depth scale of the whole image."""
-        return image_statistics(frame)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
@@ -52,24 +52,14 @@ class Antialiased(Wrapper):
         InputError: ``alpha`` is out of its range.
     """
 
-    stage = "antialias"
+    stage, whole = "antialias", True
+    takes = MOTION | {"view_projection"}
 
     def __init__(self, inner: Model, *, alpha: float = 0.2) -> None:
         super().__init__(inner)
         if not 0 < alpha <= 1:
             raise InputError(f"alpha: expected in (0, 1], found {alpha}")
-        self.alpha = alpha
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the inner method; motion is used."""
-        needs = self.inner.needs
-        return Needs(needs.buffers, needs.uses | MOTION | {"view_projection"}, needs.trainable, None)
-
-    @property
-    def persistence(self) -> float:
-        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
-        return 1 - self.alpha
+        self.alpha, self.persistence = alpha, 1 - alpha
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -35,14 +35,12 @@ published code, 0.1, for light and for moments.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs
 from mcdenoise.models._motion import surface_before
 from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
@@ -58,40 +56,14 @@ class Asvgf(Svgf):
 
     Args:
         alpha: smallest weight of the current frame where nothing changes, in (0, 1].
-        gradient_levels: how often strata are filtered, see :func:`mcdenoise.ops.temporal_gradient`.
-        threshold: likewise, of differences with noise.
-        levels: see :class:`mcdenoise.models.svgf.Svgf`.
-        sigma_z: likewise.
-        sigma_n: likewise.
-        sigma_l: likewise.
 
     Raises:
-        InputError: a setting is out of its range.
+        InputError: the weight is out of its range.
     """
 
-    def __init__(
-        self,
-        *,
-        alpha: float = 0.1,
-        gradient_levels: int = 5,
-        threshold: float = 2.0,
-        levels: int = 5,
-        sigma_z: float = 1.0,
-        sigma_n: float = 128.0,
-        sigma_l: float = 4.0,
-    ) -> None:
-        super().__init__(alpha=alpha, levels=levels, sigma_z=sigma_z, sigma_n=sigma_n, sigma_l=sigma_l)
-        if gradient_levels < 0:
-            raise InputError(f"gradient_levels: expected at least 0, found {gradient_levels}")
-        if not threshold >= 0:
-            raise InputError(f"threshold: expected at least 0, found {threshold}")
-        self.gradient_levels, self.threshold = gradient_levels, threshold
-
-    @property
-    def needs(self) -> Needs:
-        """As SVGF; samples of the frame before that are shaded once more are of use."""
-        needs = super().needs
-        return Needs(needs.buffers, needs.uses | {GRADIENT}, trainable=False)
+    def __init__(self, *, alpha: float = 0.1) -> None:
+        super().__init__(alpha=alpha)
+        self.needs = replace(self.needs, uses=self.needs.uses | {GRADIENT})
 
     def changed(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor:
         """Lambda: the fraction of the history to discard.
@@ -104,12 +76,11 @@ class Asvgf(Svgf):
         Returns:
             ``(B, 1, H, W)`` in [0, 1].
         """
-        settings: dict[str, Any] = {"levels": self.gradient_levels, "sigma_z": self.sigma_z, "sigma_n": self.sigma_n}
         surface = (frame.normal, frame.depth)
         shaded = frame.extra.get(GRADIENT)
         if shaded is not None:
             now, before, there = shaded.split(1, 1)
-            return temporal_gradient(now, before, there, None, *surface, **settings)
+            return temporal_gradient(now, before, there, None, *surface)
         moments = torch.cat([history.moments, history.length.to(history.moments.dtype)], 1)
         found, weight = reproject(moments, motion, surface_before(frame), history.surface)
         moments, length = found[:, :2], found[:, 2:].clamp_min(1)
@@ -118,9 +89,7 @@ class Asvgf(Svgf):
         noise = torch.maximum(variance_of(moments, length, frame), spatial)
         noise = noise * (1 + 1 / length.clamp_max(2 / self.alpha - 1))
         noise = noise.clamp_max(BRIGHTEST**2 / 100)
-        return temporal_gradient(
-            current[:, :1], moments[:, :1], weight, noise, *surface, threshold=self.threshold, **settings
-        )
+        return temporal_gradient(current[:, :1], moments[:, :1], weight, noise, *surface)
 
     def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
         """Light and moments with as much of their history as still holds, and its length."""

@@ -30,7 +30,6 @@ Layers and alpha are fitted, accumulated and clamped at 0 together with the colo
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -47,7 +46,7 @@ from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import Surface, block_regression, reproject
-from mcdenoise.ops.regression import BLOCK, RIDGE
+from mcdenoise.ops.regression import BLOCK
 
 # Offsets of the first block of a frame, (x, y) in pixels for blocks of 32; half a block is subtracted from both.
 _OFFSETS = (
@@ -78,11 +77,9 @@ class Bmfr(nn.Module):
     It has to be wrapped in :class:`mcdenoise.models.Accumulated` with the same limits.
 
     Args:
-        block: side of a block in pixels, at least 2.
         second_alpha: smallest weight of the current frame in the second accumulation, in (0, 1].
         position_limit: see :func:`mcdenoise.ops.reproject`, rule "bmfr".
         normal_limit: the same for normals.
-        ridge: see :func:`mcdenoise.ops.block_regression`.
 
     Raises:
         InputError: a setting is out of its range.
@@ -93,34 +90,20 @@ class Bmfr(nn.Module):
     def __init__(
         self,
         *,
-        block: int = BLOCK,
         second_alpha: float = 0.1,
         position_limit: float = POSITION_LIMIT,
         normal_limit: float = NORMAL_LIMIT,
-        ridge: float = RIDGE,
     ) -> None:
         super().__init__()
-        if block < 2:
-            raise InputError(f"block: expected at least 2, found {block}")
         if not 0 < second_alpha <= 1:
             raise InputError(f"second_alpha: expected in (0, 1], found {second_alpha}")
-        if not 0 < ridge < math.inf:
-            raise InputError(f"ridge: expected a positive number, found {ridge}")
-        self.block, self.second_alpha, self.ridge = block, second_alpha, ridge
-        self.position_limit, self.normal_limit = position_limit, normal_limit
-        starts = torch.tensor([_start(number, block) for number in range(len(_OFFSETS))])
+        self.second_alpha, self.persistence = second_alpha, 1 - second_alpha
+        self.limits = {"position_limit": position_limit, "normal_limit": normal_limit}
+        # Rows and columns of a frame's first block before the image.
+        starts = torch.tensor([[BLOCK // 2 - y, BLOCK // 2 - x] for x, y in _OFFSETS]) % BLOCK
         self.register_buffer("_starts", starts, persistent=False)
-
-    @property
-    def needs(self) -> Needs:
-        """Needs features and the history length; uses motion."""
         buffers = frozenset({"color", "normal", "position", "length"})
-        return Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
-
-    @property
-    def persistence(self) -> float:
-        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
-        return 1 - self.second_alpha
+        self.needs = Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -143,10 +126,8 @@ class Bmfr(nn.Module):
         features = torch.cat([frame.normal, frame.position], 1)
         # Images of a batch may be at different frame numbers; the offset is looked up on the device.
         rows, columns = self._starts[number.flatten().long()].unbind(1)
-        image, guide = (
-            _moved(_moved(each, rows, -2, self.block), columns, -1, self.block) for each in (images, features)
-        )
-        fitted = block_regression(image, guide, block=self.block, squares=3, ridge=self.ridge)
+        image, guide = (_moved(_moved(each, rows, -2), columns, -1) for each in (images, features))
+        fitted = block_regression(image, guide, squares=3)
         height, width = frame.size
         return _moved_back(_moved_back(fitted, rows, -2, height), columns, -1, width).clamp_min(0)
 
@@ -156,17 +137,16 @@ class Bmfr(nn.Module):
             return images
         motion = motion_unless_still(frame, history.view_projection)
         surface = surface_before(frame)._replace(depth=None)
-        limits = {"position_limit": self.position_limit, "normal_limit": self.normal_limit}
-        before, weight = reproject(history.images, motion, surface, history.surface, rule="bmfr", **limits)
+        before, weight = reproject(history.images, motion, surface, history.surface, rule="bmfr", **self.limits)
         assert frame.length is not None
         alpha = torch.where(weight > 0, (1 / frame.length).clamp_min(self.second_alpha), 1)
         return torch.lerp(before, images, alpha.to(images.dtype))
 
 
-def _moved(image: Tensor, starts: Tensor, axis: int, block: int) -> Tensor:
+def _moved(image: Tensor, starts: Tensor, axis: int) -> Tensor:
     """Shift each image ``(B, C, H, W)`` by its offset and pad it by reflection to whole blocks."""
     size = image.shape[axis]
-    places = torch.arange(-(-(size + block - 1) // block) * block, device=image.device)
+    places = torch.arange(-(-(size + BLOCK - 1) // BLOCK) * BLOCK, device=image.device)
     places = (places - starts[:, None]) % (2 * size)
     return _gathered(image, torch.minimum(places, 2 * size - 1 - places), axis)
 
@@ -184,12 +164,6 @@ def _gathered(image: Tensor, places: Tensor, axis: int) -> Tensor:
     return image.gather(axis, index.expand(shape))
 
 
-def _start(number: int, block: int) -> tuple[int, int]:
-    """Offset of a frame's first block: rows and columns before the image."""
-    x, y = _OFFSETS[number % len(_OFFSETS)]
-    return ((BLOCK // 2 - y) * block // BLOCK) % block, ((BLOCK // 2 - x) * block // BLOCK) % block
-
-
 @register_model("bmfr", kind="filter", paper="Koskela et al. 2019")
 def bmfr(
     *,
@@ -199,8 +173,6 @@ def bmfr(
     taa_alpha: float = 0.2,
     position_limit: float = POSITION_LIMIT,
     normal_limit: float = NORMAL_LIMIT,
-    block: int = BLOCK,
-    ridge: float = RIDGE,
 ) -> Model:
     """Blockwise multi-order feature regression (Koskela et al. 2019), with its accumulations and anti-aliasing.
 
@@ -212,10 +184,7 @@ def bmfr(
         position_limit: squared distance in scene units below which two points count as the same point, see
             :func:`mcdenoise.ops.reproject`.
         normal_limit: the same for normals.
-        block: see :func:`mcdenoise.ops.block_regression`.
-        ridge: see :func:`mcdenoise.ops.block_regression`.
     """
-    limits = {"position_limit": position_limit, "normal_limit": normal_limit}
-    fit = Bmfr(block=block, second_alpha=second_alpha, ridge=ridge, **limits)
+    fit = Bmfr(second_alpha=second_alpha, position_limit=position_limit, normal_limit=normal_limit)
     model = as_published(fit, alpha_min, position_limit, normal_limit)
     return Antialiased(model, alpha=taa_alpha) if taa else model

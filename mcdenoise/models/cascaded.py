@@ -24,9 +24,9 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import TenChannels, published
+from mcdenoise.models._published import Network, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
@@ -40,7 +40,7 @@ Normalize = Literal["softmax", "none"]
 LEVELS = 4  # of the U-Net
 
 
-class _Network(TenChannels):
+class _Scales(Network):
     """The U-Net of Fig. 2, with a head and a fusion module at the scales of its last three decoder layers."""
 
     def __init__(self, width: int, channels: int, radius: int) -> None:
@@ -50,16 +50,10 @@ class _Network(TenChannels):
         self.fusions: Sequence[FusionModule] = nn.ModuleList(  # type: ignore[assignment]
             FusionModule() for _ in range(self.unet.scales - 1)
         )
-        self._radius = radius
-
-    @property
-    def needs(self) -> Needs:
-        """The reach adds a pixel for head and fusion and the filter's radius, at each scale, to that of the U-Net."""
-        ways = (self.unet.reach(scale) + ((1 + self._radius) << scale) for scale in range(self.unet.scales))
+        # At each scale a pixel for head and fusion, and the filter's radius, beyond the U-Net.
+        ways = (self.unet.reach(scale) + ((1 + radius) << scale) for scale in range(self.unet.scales))
         reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
-        return Needs(
-            uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple, live=self.unet.live
-        )
+        self.needs = Needs(uses=GUIDES, reach=reach, stride=self.unet.multiple, live=self.unet.live)
 
     def fuse(self, images: list[Tensor]) -> Tensor:
         """Fuse the scales of an image, finest first."""
@@ -78,7 +72,7 @@ class _Network(TenChannels):
         return fused, others
 
 
-class PixelNetwork(_Network):
+class PixelNetwork(_Scales):
     """P: predicts the image at three scales and fuses them.
 
     Args:
@@ -95,7 +89,7 @@ class PixelNetwork(_Network):
         return Output(self.fuse([image.to(frame.color.dtype) for image in images])), None  #                    Eq. 1
 
 
-class KernelNetwork(_Network):
+class KernelNetwork(_Scales):
     """K: predicts a kernel for each pixel at three scales, adjusts it by the features, filters, and fuses.
 
     Args:

@@ -55,15 +55,11 @@ class _Network(nn.Module):
         self.fusions: Sequence[LogFusion] = nn.ModuleList(  # type: ignore[assignment]
             LogFusion() for _ in range(self.unet.scales - 1)
         )
-        self._radius = radius
-
-    @property
-    def needs(self) -> Needs:
-        """The reach adds a pixel for head and fusion and the filter's radius, at each scale, to that of the U-Net."""
-        heads = (max(1 << scale, self.unet.stride) for scale in range(self.unet.scales))
-        ways = (self.unet.reach(scale) + head + (self._radius << scale) for scale, head in enumerate(heads))
-        reach = max(ways) + sum(1 << scale for scale in range(self.unet.scales - 1))
-        return Needs(uses=_USES, reach=reach, stride=self.unet.multiple, live=self.unet.live)
+        # At each scale a pixel for head and fusion, and the filter's radius, beyond the U-Net.
+        heads = (max(1 << scale, unet.stride) for scale in range(unet.scales))
+        ways = (unet.reach(scale) + head + (radius << scale) for scale, head in enumerate(heads))
+        reach = max(ways) + sum(1 << scale for scale in range(unet.scales - 1))
+        self.needs = Needs(uses=_USES, reach=reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """Exposure, depth scale, and the logarithm of the brightest pixel of this network's own input."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._fireflies import GAIN, believed, clamped_fraction, light_of, light_of_fireflies, with_light
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import Note, Output, State
 from mcdenoise.models._motion import motion_to_previous
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
@@ -50,18 +50,9 @@ class Clamped(Wrapper):
         inner: any method.
     """
 
-    stage = "clamp"
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the inner method; albedo is used, and the limit depends on the whole image."""
-        needs = self.inner.needs
-        return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, None, needs.stride)
-
-    @property
-    def persistence(self) -> float:
-        """What one more frame leaves of the limit's lack, see :func:`mcdenoise.models.frames_remembered`."""
-        return 1 / GAIN
+    stage, whole = "clamp", True
+    takes = frozenset({"albedo"})
+    persistence = 1 / GAIN  # of the limit's lack
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -41,9 +43,9 @@ class CoarseToFine(Wrapper):
     @property
     def needs(self) -> Needs:
         """The needs of the method; the reach is that of the coarsest size."""
-        needs, factor = self.inner.needs, 1 << (self.resolutions - 1)
+        needs, factor = super().needs, 1 << (self.resolutions - 1)
         reach = None if needs.reach is None else (needs.reach + BLOCK) * factor
-        return Needs(needs.buffers, needs.uses, needs.trainable, reach, needs.stride * factor)
+        return replace(needs, reach=reach, stride=needs.stride * factor)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame, scale_samples
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import Note, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper, run
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
@@ -29,12 +29,7 @@ class Demodulated(Wrapper):
     """
 
     stage = "accumulate"
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the inner method; the albedo is used."""
-        needs = self.inner.needs
-        return Needs(needs.buffers, needs.uses | {"albedo"}, needs.trainable, needs.reach, needs.stride)
+    takes = frozenset({"albedo"})
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The statistics of the inner model for the demodulated frame."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
@@ -52,12 +52,8 @@ class Guided(nn.Module):
         if not 0 < eps < math.inf:
             raise InputError(f"eps: expected a positive number, found {eps}")
         self.radius, self.eps = radius, eps
-
-    @property
-    def needs(self) -> Needs:
-        """Color; features guide. A pixel sees all windows that it lies in."""
-        reach = 2 * self.radius + 1
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=reach, live=_LIVE)
+        # A pixel sees all windows that it lies in.
+        self.needs = Needs(uses=GUIDES, trainable=False, reach=2 * radius + 1, live=_LIVE)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """See :func:`mcdenoise.models.joint_bilateral.guide_statistics`."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._void import ISLAND
@@ -58,13 +58,9 @@ class JointBilateral(nn.Module):
                 raise InputError(f"{name}: expected a positive number, found {sigma}")
         self.sigma_color, self.sigma_space = sigma_color, sigma_space
         self.radius = math.ceil(2 * sigma_space)
-
-    @property
-    def needs(self) -> Needs:
-        """Color; features guide."""
         # Its windows, unfolded, and as much again for their weights' derivatives.
         live = Live(0, 2 * _CHANNELS * (2 * self.radius + 1) ** 2)
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), trainable=False, reach=self.radius + 1, live=live)
+        self.needs = Needs(uses=GUIDES, trainable=False, reach=self.radius + 1, live=live)
 
     @property
     def side(self) -> int:

@@ -12,15 +12,15 @@ from __future__ import annotations
 from torch import nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import TenChannels, check_odd, published
+from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.mrkp import Backbone, with_glorot
 from mcdenoise.ops import cross_bilateral_filter
 
 
-class KpNetwork(TenChannels):
+class KpNetwork(Network):
     """Predicts a kernel for each pixel, and filters with it.
 
     Args:
@@ -34,14 +34,11 @@ class KpNetwork(TenChannels):
     def __init__(self, width: int = 48, kernel_size: int = 13) -> None:
         super().__init__()
         check_odd(kernel_size)
-        self.unet, self._radius = Backbone(10, width), kernel_size // 2
+        self.unet = Backbone(10, width)
         self.head = with_glorot(nn.Conv2d(self.unet.out_channels, kernel_size**2, 3, padding=1))
-
-    @property
-    def needs(self) -> Needs:
-        """The reach adds a pixel for the head and the radius of the filter to that of the U-Net."""
-        reach = self.unet.reach() + 1 + self._radius
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=self.unet.multiple)
+        # A pixel for the head.
+        reach = self.unet.reach() + 1 + kernel_size // 2
+        self.needs = Needs(uses=GUIDES, reach=reach, stride=self.unet.multiple)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -42,12 +42,12 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import check_odd, published
+from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.svgf import BRIGHTEST
-from mcdenoise.nn.inputs import image_statistics, unit_features_of
+from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops import cross_bilateral_filter, demodulate, luminance_moments, moments_variance
 
@@ -74,7 +74,7 @@ class _Branch(nn.Sequential):
         return found[:, :3], None if others is None else found[:, 3:]
 
 
-class KpcnNetwork(nn.Module):
+class KpcnNetwork(Network):
     """Both branches; the diffuse one takes demodulated light.
 
     Args:
@@ -96,21 +96,12 @@ class KpcnNetwork(nn.Module):
         check_odd(kernel_size)
         self.diffuse = _Branch(width, layers, kernel_size)
         self.specular = _Branch(width, layers, kernel_size) if split else None
-        # The reach: convolutions, the variance estimate with the depth slope at its taps, and the kernel.
-        self._reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
+        # Convolutions, the variance estimate with the depth slope at its taps, and the kernel.
+        reach = layers * (_CONVOLUTION // 2) + _WINDOW // 2 + 1 + kernel_size // 2
         # Measured at the default's sizes: 3.8 kB a pixel.
-        self._live = 4 * max(width, CHANNELS) + 6 * kernel_size**2
-
-    @property
-    def needs(self) -> Needs:
-        """Uses features, and diffuse and specular light."""
-        uses = frozenset({"albedo", "normal", "depth"})
-        parts = frozenset({"diffuse", "specular", "emission"} if self.specular is not None else ())
-        return Needs(uses=uses | parts, reach=self._reach, live=Live(self._live))
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
-        return image_statistics(frame)
+        live = Live(4 * max(width, CHANNELS) + 6 * kernel_size**2)
+        parts = frozenset({"diffuse", "specular", "emission"} if split else ())
+        self.needs = Needs(uses=GUIDES | parts, reach=reach, live=live)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -28,17 +28,14 @@ in both layers in proportion to its weights.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import check_odd, published
+from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
     CHANNELS,
     PLANNED,
@@ -59,7 +56,7 @@ LAYERS = 2
 _LEAST = 1e-3
 
 
-class LayeredNetwork(nn.Module):
+class LayeredNetwork(Network):
     """Predicts the layer weights of each sample, and the kernels and alpha of the layers.
 
     Args:
@@ -78,19 +75,12 @@ class LayeredNetwork(nn.Module):
         self.partition = chain([2 * width, width, LAYERS], linear=True)
         self.unet = LeakyUNet((LAYERS + 1) * width, width, convolutions)
         self.head = chain([width, LAYERS * self.taps + LAYERS - 1], linear=True)
-        self._reach = 2 * LeakyUNet.reach(convolutions) + kernel_size // 2
+        reach = 2 * LeakyUNet.reach(convolutions) + kernel_size // 2
         # Measured at the default's sizes, with eight samples and the history: 6.4 kB a pixel.
-        self._live = width * (6 * PLANNED + 12) + 2 * LAYERS * self.taps
-
-    @property
-    def needs(self) -> Needs:
-        """Uses features, samples, and the history length, which marks the accumulated sample."""
-        uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
-        return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple, live=Live(self._live))
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
-        return image_statistics(frame)
+        live = Live(width * (6 * PLANNED + 12) + 2 * LAYERS * self.taps)
+        # The history's length marks the accumulated sample.
+        uses = GUIDES | {"samples", "length"}
+        self.needs = Needs(uses=uses, reach=reach, stride=LeakyUNet.multiple, live=live)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

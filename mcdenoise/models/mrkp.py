@@ -24,9 +24,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import TenChannels, check_odd, published
+from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
@@ -94,7 +94,7 @@ def with_glorot(layer: nn.Module) -> nn.Module:
     return layer
 
 
-class MrkpNetwork(TenChannels):
+class MrkpNetwork(Network):
     """Predicts kernels and blending weights at three scales, filters each, and blends them from coarse to fine.
 
     Args:
@@ -108,18 +108,14 @@ class MrkpNetwork(TenChannels):
     def __init__(self, width: int = 48, kernel_size: int = 5) -> None:
         super().__init__()
         check_odd(kernel_size)
-        self.unet, self.taps, self._radius = Backbone(10, width), kernel_size**2, kernel_size // 2
+        self.unet, self.taps = Backbone(10, width), kernel_size**2
         channels = self.taps + 1
         self.heads = nn.ModuleList(
             with_glorot(nn.Conv2d(self.unet.out_channels, channels, 3, padding=1)) for _ in range(SCALES)
         )
-
-    @property
-    def needs(self) -> Needs:
-        """See :func:`reach_of`."""
-        return Needs(
-            uses=frozenset({"albedo", "normal", "depth"}), reach=reach_of(self._radius), stride=self.unet.multiple
-        )
+        # Beyond the features a pixel for each head, the radius, and two pixels for each upsampling, at their scales.
+        own = ((1 + kernel_size // 2) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
+        self.needs = Needs(uses=GUIDES, reach=self.unet.reach() + own, stride=self.unet.multiple)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -131,15 +127,6 @@ class MrkpNetwork(TenChannels):
             kernel, alpha = predicted.split([self.taps, 1], 1)
             blended = blend_scales(_filter(n, kernel), blended, alpha)
         return answered(frame, blended.clamp_min(0).to(frame.color.dtype)), None
-
-
-def reach_of(radius: int) -> int:
-    """Reach of a network that runs a filter of this radius at each scale.
-
-    The features' reach plus a pixel for each head, the radius, and two pixels for each upsampling, at their scales.
-    """
-    own = ((1 + radius) << (SCALES - 1)) + sum(4 << scale for scale in range(SCALES))
-    return Backbone.reach() + own
 
 
 def scales_of(image: Tensor) -> list[Tensor]:

@@ -39,9 +39,9 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import TenChannels, displayed, published
+from mcdenoise.models._published import Network, displayed, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops import grid_slice, grid_splat
@@ -55,7 +55,7 @@ _LARGEST = 100.0
 _LIVE = Live(0, 275)
 
 
-class NeuralBilateralGrid(TenChannels):
+class NeuralBilateralGrid(Network):
     """The network, its three grids, and the sum of their results.
 
     Args:
@@ -74,13 +74,9 @@ class NeuralBilateralGrid(TenChannels):
             _convolution(_FIRST + number * _GROWTH, _GROWTH) for number in range(layers - 2)
         )
         self.last = _convolution(_FIRST + len(self.dense) * _GROWTH, _OUTPUTS)
-
-    @property
-    def needs(self) -> Needs:
-        """The reach is two pixels per convolution, plus the distance via a cell's centre to its farthest pixel."""
         coarsest = max(cell for cell, _ in GRIDS)
-        reach = 2 * (2 + len(self.dense)) + 2 * coarsest
-        return Needs(uses=frozenset({"albedo", "normal", "depth"}), reach=reach, stride=coarsest, live=_LIVE)
+        # Two pixels per convolution, plus the distance via a cell's centre to its farthest pixel.
+        self.needs = Needs(uses=GUIDES, reach=2 * layers + 2 * coarsest, stride=coarsest, live=_LIVE)
 
     def predicted(self, frame: Frame) -> Tensor:
         """Three guides and two weights, ``(B, 5, H, W)`` in [0, 1]."""

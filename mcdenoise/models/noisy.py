@@ -21,11 +21,7 @@ class Noisy(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-
-    @property
-    def needs(self) -> Needs:
-        """Needs the color; each pixel depends only on itself."""
-        return Needs(trainable=False, reach=0)
+        self.needs = Needs(trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

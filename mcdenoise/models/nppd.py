@@ -48,7 +48,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._registry import register_model
@@ -194,6 +194,10 @@ class Nppd(nn.Module):
         backbone: type of the network.
     """
 
+    # Means of the whole image and the history allow no tiles.
+    needs = Needs(uses=MOTION | GUIDES | {"samples", "view_projection"})
+    persistence = None  # the network learns what to remember
+
     def __init__(self, width: int, backbone: Backbone) -> None:
         super().__init__()
         self.encoder = nn.Sequential(
@@ -206,15 +210,6 @@ class Nppd(nn.Module):
         predicted = [sum(_FINE.values())] + [sum(_COARSE.values())] * (LEVELS - 1)
         network = ConvUNet if backbone == "convunet" else ConvUNeXt
         self.network: ConvUNet | ConvUNeXt = network(6 + 2 * FEATURES, predicted, width)
-
-    @property
-    def persistence(self) -> None:
-        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
-
-    @property
-    def needs(self) -> Needs:
-        """It uses means of the whole image and a history, so it has no tiles."""
-        return Needs(uses=MOTION | {"albedo", "normal", "depth", "samples", "view_projection"})
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

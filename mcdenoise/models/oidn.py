@@ -48,6 +48,8 @@ class Oidn(nn.Module):
         self, quality: Quality = "high", auxiliary: Auxiliary = "noisy", *, threads: int | None = None
     ) -> None:
         super().__init__()
+        # The result depends on the whole image through its exposure.
+        self.needs = Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
         _check("quality", quality, Quality)
         _check("auxiliary", auxiliary, Auxiliary)
         if threads is not None and threads < 1:
@@ -67,11 +69,6 @@ class Oidn(nn.Module):
     def __deepcopy__(self, memo: dict[int, Any]) -> Oidn:
         """A new object with the same settings, because a device of the library cannot be copied."""
         return Oidn(self.quality, self.auxiliary, threads=self.threads)
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses albedo and normal. The result depends on the whole image through its exposure."""
-        return Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`.

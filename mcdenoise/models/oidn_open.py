@@ -44,12 +44,9 @@ class OidnOpen(nn.Module):
         super().__init__()
         self.features = tuple(features)
         self.unet = OidnUNet(3 + 3 * len(self.features), size)
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color and its features. It comes with weights, which can be trained further."""
-        buffers = frozenset({"color", *self.features})
-        return Needs(buffers, trainable=False, reach=self.unet.reach, stride=self.unet.multiple, live=self.unet.live)
+        # It comes with weights, which can be trained further.
+        buffers, unet = frozenset({"color", *features}), self.unet
+        self.needs = Needs(buffers, trainable=False, reach=unet.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
@@ -126,6 +123,7 @@ class OpenFilters(nn.Module):
     def __init__(self, quality: Quality = "high", *, prefilter: Quality | None = "high") -> None:
         super().__init__()
         self.quality = quality
+        self.needs = Needs(uses=frozenset(_FEATURES), trainable=False)
         self.networks = nn.ModuleDict()
         self._network(_IMAGES, quality, clean=False)
         if prefilter:
@@ -136,11 +134,6 @@ class OpenFilters(nn.Module):
     def state_dict(self, *args: Any, destination: Any = None, prefix: str = "", keep_vars: bool = False) -> Any:
         """Nothing: the library has the weights."""
         return {} if destination is None else destination
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses albedo and normal."""
-        return Needs(uses=frozenset(_FEATURES), trainable=False)
 
     def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
         """The denoised color ``(B, 3, H, W)``, see :meth:`mcdenoise.models.oidn.Oidn.denoised`."""

@@ -44,11 +44,7 @@ class Mixed(nn.Module):
     def __init__(self, clean_part: float = _CLEAN_PART) -> None:
         super().__init__()
         self.clean_part = clean_part
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses the images that it combines."""
-        return Needs(uses=frozenset({OIDN, OIDN_CLEAN} if self.clean_part else {OIDN}), trainable=False, reach=0)
+        self.needs = Needs(uses=frozenset({OIDN, OIDN_CLEAN} if clean_part else {OIDN}), trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

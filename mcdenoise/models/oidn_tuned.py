@@ -77,12 +77,8 @@ class TunedNetwork(nn.Module):
         self.unet = OidnUNet(_CHANNELS, size, out_channels=3 + len(_LOGITS))
         self.start = _with_buffers(copy.deepcopy(self.unet))
         self.register_buffer("kept", torch.zeros(()))
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses albedo, normal, and the previous result."""
-        uses = frozenset({"albedo", "normal", PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
-        return Needs(uses=uses, reach=self.unet.reach, stride=self.unet.multiple, live=self.unet.live)
+        uses, unet = frozenset({"albedo", "normal", PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT}), self.unet
+        self.needs = Needs(uses=uses, reach=unet.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image, and the fraction of the initial weights for its noise."""

@@ -87,6 +87,10 @@ class Rae(nn.Module):
         width: channels of the first stage, the paper's 32.
     """
 
+    # Motion is for detecting cuts.
+    needs = Needs(uses=MOTION | {"normal", "depth", "roughness", "view_projection"})
+    persistence = None  # the network learns what to remember
+
     def __init__(self, width: int = 32) -> None:
         super().__init__()
         widths = [round(width * GROWTH**stage) for stage in range(STAGES)]
@@ -103,16 +107,6 @@ class Rae(nn.Module):
         )
         last = self.decoder[-1][-1].bias
         nn.init.constant_(last, math.log1p(_TYPICAL))  # type: ignore[arg-type]
-
-    @property
-    def persistence(self) -> None:
-        """Unknown, since the network learns what to remember; see :func:`mcdenoise.models.frames_remembered`."""
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses features, and motion for detecting cuts."""
-        features = frozenset({"normal", "depth", "roughness", "view_projection"})
-        return Needs(uses=features | MOTION)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Model, Note, Output, State
 from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.models._state import own_state
 from mcdenoise.models._wrapper import Wrapper
@@ -56,19 +56,13 @@ class Recurrent(Wrapper):
         albedo: name of the buffer that images are demodulated with; a frame without it is not demodulated.
     """
 
-    stage = "accumulate"
+    stage, whole = "accumulate", True
+    takes = MOTION | {"view_projection", "normal", "depth"}
+    gives = frozenset({PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
 
     def __init__(self, inner: Model, *, albedo: str = "albedo") -> None:
         super().__init__(inner)
         self.albedo = albedo
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the inner method without the buffers provided here; motion is used."""
-        needs = self.inner.needs
-        given = frozenset({PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
-        uses = (needs.uses - given) | MOTION | {"view_projection", "normal", "depth"}
-        return Needs(needs.buffers - given, uses, needs.trainable, None)
 
     @property
     def persistence(self) -> float | None:

@@ -21,10 +21,11 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, Skip
-from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
+from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, State, prepared
+from mcdenoise.models._published import Network
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.inputs import FEATURES, features_of, image_statistics, input_of
+from mcdenoise.nn.inputs import FEATURES, features_of, input_of
 from mcdenoise.nn.unet import Head, UNet
 from mcdenoise.ops import downsample, kernel_conv, upsample
 from mcdenoise.ops.demodulation import modulation
@@ -37,7 +38,7 @@ _TAPS = 9
 _CENTRE, _COARSER, _DIFFUSE, _HISTORY = 5.0, -5.0, 4.0, 2.0
 
 
-class FeatureNetwork(nn.Module):
+class FeatureNetwork(Network):
     """Predicts kernels for albedo and normal at three scales and the fraction of each coarser scale, and filters.
 
     Args:
@@ -58,22 +59,11 @@ class FeatureNetwork(nn.Module):
             with torch.no_grad():
                 # A head at half the resolution predicts each channel for 2x2 pixels.
                 head.bias.copy_(rest.repeat_interleave(head.side**2))  # type: ignore[operator]
-
-    @property
-    def needs(self) -> Needs:
-        """The reach of the U-Net plus that of head, kernel and interpolation at each scale."""
+        # Beyond the U-Net head, kernel and interpolation at each scale.
         scales = range(self.unet.scales)
         reach = max(self.unet.reach(scale) + (2 << scale) for scale in scales) + sum(2 << scale for scale in scales)
-        return Needs(
-            uses=frozenset({"albedo", "normal", "depth", "current", "length"}),
-            reach=reach,
-            stride=self.unet.multiple,
-            live=self.unet.live,
-        )
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """Exposure and depth scale of the whole image."""
-        return image_statistics(frame)
+        uses = GUIDES | {"current", "length"}
+        self.needs = Needs(uses=uses, reach=reach, stride=self.unet.multiple, live=self.unet.live)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """The filtered albedo; as stages the filtered normal and divisor of the demodulation, and the fraction m."""

@@ -9,6 +9,7 @@ Whiteness Measures", IEEE Transactions on Image Processing 22). No weights are l
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import lcm
 
 import torch
@@ -36,9 +37,9 @@ class Restored(Wrapper):
     @property
     def needs(self) -> Needs:
         """The needs of the inner method; windows add to its reach."""
-        needs = self.inner.needs
+        needs = super().needs
         reach = None if needs.reach is None else needs.reach + REACH
-        return Needs(needs.buffers, needs.uses, needs.trainable, reach, lcm(needs.stride, CELL))
+        return replace(needs, reach=reach, stride=lcm(needs.stride, CELL))
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -28,14 +28,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._published import check_odd, published
+from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models._registry import register_model
-from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import (
     CHANNELS,
     PLANNED,
@@ -53,7 +51,7 @@ from mcdenoise.ops import softmax_splat
 PUBLISHED: Mapping[str, Any] = {"width": 128, "rounds": 3, "convolutions": 3, "kernel_size": 21}
 
 
-class SbmcNetwork(nn.Module):
+class SbmcNetwork(Network):
     """Predicts a kernel for every sample, and splats the samples with these kernels.
 
     Args:
@@ -71,19 +69,12 @@ class SbmcNetwork(nn.Module):
         check_odd(kernel_size)
         self.embedding = SampleEmbedding(CHANNELS, width, rounds, convolutions)
         self.kernel = chain([2 * width, width, width, kernel_size**2], linear=True)
-        self._reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
+        reach = rounds * LeakyUNet.reach(convolutions) + kernel_size // 2
         # Measured at the default's sizes, with eight samples and the history: 8.2 kB a pixel.
-        self._live = width * (8 * PLANNED + 8) + 6 * kernel_size**2
-
-    @property
-    def needs(self) -> Needs:
-        """Uses features, samples, and the history length, which marks the accumulated sample."""
-        uses = frozenset({"albedo", "normal", "depth", "samples", "length"})
-        return Needs(uses=uses, reach=self._reach, stride=LeakyUNet.multiple, live=Live(self._live))
-
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """The depth scale of the whole image."""
-        return image_statistics(frame)
+        live = Live(width * (8 * PLANNED + 8) + 6 * kernel_size**2)
+        # The history's length marks the accumulated sample.
+        uses = GUIDES | {"samples", "length"}
+        self.needs = Needs(uses=uses, reach=reach, stride=LeakyUNet.multiple, live=live)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""

@@ -56,18 +56,9 @@ class Steadied(nn.Module):
         super().__init__()
         if not 0 < history < math.inf:
             raise InputError(f"history: expected above 0, found {history}")
-        self.history = history
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses the images that it blends."""
+        self.history, self.persistence = history, history / (1 + history)
         uses = frozenset({NOISY, CENTRED, PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT})
-        return Needs(uses=uses, trainable=False, reach=max(_WINDOWS) // 2)
-
-    @property
-    def persistence(self) -> float:
-        """Fraction of the history that one more frame leaves, see :func:`mcdenoise.models.frames_remembered`."""
-        return self.history / (1 + self.history)
+        self.needs = Needs(uses=uses, trainable=False, reach=max(_WINDOWS) // 2)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""

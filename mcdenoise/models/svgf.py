@@ -28,6 +28,7 @@ from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moment
 
 # With fewer frames, moments over time hardly determine the variance.
 _FEW_FRAMES, WINDOW = 4, 7
+LEVELS = 5  # of the a-trous transform, whose taps lie 1, 2, 4, ... pixels apart
 # Brighter light counts as this in the moments, so that float32 can represent the square.
 BRIGHTEST = 1e18
 
@@ -55,44 +56,17 @@ class Svgf(nn.Module):
 
     Args:
         alpha: smallest weight of the current frame, of light and of moments, in (0, 1].
-        levels: of the a-trous transform, whose taps lie 1, 2, 4, ... pixels apart.
-        sigma_z: see :func:`mcdenoise.ops.atrous`.
-        sigma_n: likewise.
-        sigma_l: likewise.
 
     Raises:
-        InputError: a setting is out of its range.
+        InputError: the weight is out of its range.
     """
 
-    def __init__(
-        self,
-        *,
-        alpha: float = 0.2,
-        levels: int = 5,
-        sigma_z: float = 1.0,
-        sigma_n: float = 128.0,
-        sigma_l: float = 4.0,
-    ) -> None:
+    def __init__(self, *, alpha: float = 0.2) -> None:
         super().__init__()
         if not 0 < alpha <= 1:
             raise InputError(f"alpha: expected in (0, 1], found {alpha}")
-        if levels < 1:
-            raise InputError(f"levels: expected at least 1, found {levels}")
-        for name, sigma, least in (("sigma_z", sigma_z, 0), ("sigma_n", sigma_n, 1), ("sigma_l", sigma_l, 0)):
-            if not max(sigma, 1e-30) == sigma >= least:
-                raise InputError(f"{name}: expected a positive number of at least {least}, found {sigma}")
-        self.alpha, self.levels = alpha, levels
-        self.sigma_z, self.sigma_n, self.sigma_l = sigma_z, sigma_n, sigma_l
-
-    @property
-    def needs(self) -> Needs:
-        """Normals and depths, at which it stops; whatever tells motion is of use."""
-        return Needs(frozenset({"color", "normal", "depth"}), MOTION | {"view_projection"}, trainable=False)
-
-    @property
-    def persistence(self) -> float:
-        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
-        return 1 - self.alpha
+        self.alpha, self.persistence = alpha, 1 - alpha
+        self.needs = Needs(frozenset({"color", "normal", "depth"}), MOTION | {"view_projection"}, trainable=False)
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -104,18 +78,8 @@ class Svgf(nn.Module):
         light, moments, length = self._accumulate(frame, entering, None if reset else history, motion)
         variance = variance_of(moments, length, frame)
         filtered, kept = light, light
-        for level in range(self.levels):
-            # Eqs. 1 and 2.
-            filtered, variance = atrous(
-                filtered,
-                variance,
-                normal,
-                depth,
-                step=1 << level,
-                sigma_z=self.sigma_z,
-                sigma_n=self.sigma_n,
-                sigma_l=self.sigma_l,
-            )
+        for level in range(LEVELS):
+            filtered, variance = atrous(filtered, variance, normal, depth, step=1 << level)  #             Eqs. 1 and 2
             # Sec. 4.3: the first level feeds the history.
             kept = filtered if level == 0 else kept
         surface = Surface(frame.position, normal, depth)

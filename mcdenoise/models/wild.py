@@ -71,13 +71,8 @@ class WildNetwork(nn.Module):
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.zero_()[3].fill_(_LITTLE)
-
-    @property
-    def needs(self) -> Needs:
-        """Needs color; uses this frame's, the length of the history, albedo, normal, and the previous result."""
-        uses = frozenset({"current", "length", "albedo", "normal", *((PREVIOUS, PREVIOUS_WEIGHT) * self.previous)})
-        unet = self.unet
-        return Needs(uses=uses, reach=self.stem * unet.reach, stride=self.stem * unet.multiple, live=unet.live)
+        uses, unet = {"current", "length", "albedo", "normal", *((PREVIOUS, PREVIOUS_WEIGHT) * previous)}, self.unet
+        self.needs = Needs(uses=frozenset(uses), reach=stem * unet.reach, stride=stem * unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""

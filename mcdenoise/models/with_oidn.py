@@ -22,7 +22,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.clamped import without_fireflies
@@ -77,6 +77,10 @@ class WithOidn(Wrapper):
             :class:`mcdenoise.models.oidn.Oidn`.
     """
 
+    whole = True
+    takes = frozenset({"albedo", "normal"})
+    gives = frozenset({OIDN, OIDN_CLEAN, OIDN_ALBEDO, NOISY, CENTRED})
+
     def __init__(
         self,
         inner: Model,
@@ -95,13 +99,6 @@ class WithOidn(Wrapper):
         self.prefilter, self.clean = prefilter, clean
         self._library = Oidn(quality, threads=threads)
         self._filters = self._made_in_torch() if engine == "torch" else None
-
-    @property
-    def needs(self) -> Needs:
-        """The needs of the inner method without the buffers provided here; albedo and normal are used."""
-        needs = self.inner.needs
-        given = frozenset({OIDN, OIDN_CLEAN, OIDN_ALBEDO, NOISY, CENTRED})
-        return Needs(needs.buffers - given, (needs.uses - given) | self._library.needs.uses, needs.trainable, None)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """None, because the statistics of the inner method may depend on OIDN's images."""

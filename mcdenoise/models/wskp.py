@@ -28,9 +28,9 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Needs, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import TenChannels, displayed, published
+from mcdenoise.models._published import Network, displayed, published
 from mcdenoise.models._registry import register_model
 from mcdenoise.ops import importance_filter
 
@@ -68,7 +68,7 @@ class Reparameterized(nn.Module):
         return F.conv2d(x, self.merged(), padding=2)
 
 
-class WskpNetwork(TenChannels):
+class WskpNetwork(Network):
     """Predicts importance maps and blending weights, and filters with them.
 
     Args:
@@ -85,12 +85,7 @@ class WskpNetwork(TenChannels):
             Reparameterized(entering, leaving, 0 < i < layers - 1)
             for i, (entering, leaving) in enumerate(itertools.pairwise(channels))
         )
-
-    @property
-    def needs(self) -> Needs:
-        """The reach is two pixels per convolution plus the radius of the largest kernel."""
-        uses = frozenset({"albedo", "normal", "depth"})
-        return Needs(uses=uses, reach=2 * len(self.layers) + max(SIDES) // 2)
+        self.needs = Needs(uses=GUIDES, reach=2 * layers + max(SIDES) // 2)
 
     def maps(self, frame: Frame) -> tuple[Tensor, Tensor]:
         """Importance ``(B, 6, H, W)`` and blending weights ``(B, 6, H, W)`` of sum 1."""

@@ -9,7 +9,7 @@ import torch
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, create_model, parts_of
-from mcdenoise.models._published import TenChannels, displayed
+from mcdenoise.models._published import Network, displayed
 
 WEARERS = ["bmfr", "cascaded", "kp", "kpcn", "layered", "mrkp", "nbgd", "sbmc", "wskp"]
 
@@ -28,7 +28,7 @@ def test_the_ten_channels() -> None:
     image, albedo = torch.rand(2, 3, 4, 5), torch.rand(2, 3, 4, 5)
     normal, depth = torch.rand(2, 3, 4, 5) * 2 - 1, torch.full((2, 1, 4, 5), 7.0)
     depth[:, :, 0] = torch.inf
-    seen = TenChannels().input_of(Frame(image, albedo=albedo, normal=normal, depth=depth), 2 * image)
+    seen = Network().input_of(Frame(image, albedo=albedo, normal=normal, depth=depth), 2 * image)
     # All surfaces are at the typical depth.
     near = torch.where(torch.isinf(depth), 1.0, 0.5)
     torch.testing.assert_close(seen, torch.cat([2 * image, albedo, (normal + 1) / 2, near], 1))

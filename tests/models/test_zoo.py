@@ -14,8 +14,8 @@ from mcdenoise import Denoiser, create_model
 
 WRONG: dict[str, dict[str, Any]] = {
     "accumulated": {"alpha_min": 0},
-    "asvgf": {"alpha": 0.0, "levels": 0, "gradient_levels": -1, "threshold": -1.0},
-    "bmfr": {"alpha_min": 0.0, "second_alpha": 2.0, "block": 1, "ridge": 0.0},
+    "asvgf": {"alpha": 0.0},
+    "bmfr": {"alpha_min": 0.0, "second_alpha": 2.0},
     "cascaded": {"cascade": "K+K+K"},
     "cascaded_v2": {"tolerance": -1},
     "guided": {"radius": 0, "eps": torch.nan},
@@ -28,7 +28,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "oidn": {"quality": "best", "auxiliary": "none", "source": "none", "threads": 0},
     "oidn_temporal": {"auxiliary": "clean", "engine": "none", "prefilter": "none", "history": 0.0},
     "sbmc": {"width": 0, "rounds": 0, "convolutions": 0, "kernel_size": 0},
-    "svgf": {"alpha": 0.0, "levels": 0, "sigma_z": 0.0, "sigma_n": 0.5, "sigma_l": -1.0},
+    "svgf": {"alpha": 0.0},
     "wskp": {"layers": 1},
 }
 
