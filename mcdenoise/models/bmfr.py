@@ -53,6 +53,8 @@ _OFFSETS = (
     *((-14, -14), (4, -6), (-8, 14), (8, 0), (-10, -8), (2, 12), (12, -12), (-10, 0)),
     *((12, 14), (-8, -16), (6, 6), (-2, -2), (6, -14), (-16, 12), (14, -4), (-6, 4)),
 )
+# Rows and columns of a frame's first block before the image.
+STARTS = [((BLOCK // 2 - y) % BLOCK, (BLOCK // 2 - x) % BLOCK) for x, y in _OFFSETS]
 
 
 class History(NamedTuple):
@@ -99,9 +101,7 @@ class Bmfr(nn.Module):
             raise InputError(f"second_alpha: expected in (0, 1], found {second_alpha}")
         self.second_alpha, self.persistence = second_alpha, 1 - second_alpha
         self.limits = {"position_limit": position_limit, "normal_limit": normal_limit}
-        # Rows and columns of a frame's first block before the image.
-        starts = torch.tensor([[BLOCK // 2 - y, BLOCK // 2 - x] for x, y in _OFFSETS]) % BLOCK
-        self.register_buffer("_starts", starts, persistent=False)
+        self.register_buffer("_starts", torch.tensor(STARTS), persistent=False)
         buffers = frozenset({"color", "normal", "position", "length"})
         self.needs = Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
 

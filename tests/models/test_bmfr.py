@@ -12,7 +12,7 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
 from mcdenoise.models.antialiased import Antialiased
-from mcdenoise.models.bmfr import Bmfr, _start
+from mcdenoise.models.bmfr import STARTS, Bmfr
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.ops import block_regression
 
@@ -42,7 +42,7 @@ def test_a_frame_is_accumulated_fitted_and_accumulated_again() -> None:
         alpha = max(1 / (number + 1), 0.2)
         first = alpha * given.color + (1 - alpha) * first
         features = torch.cat([given.normal, given.position], 1)
-        fitted = block_regression(first, features, squares=3, offset=_start(number, 32)).clamp_min(0)
+        fitted = block_regression(first, features, squares=3, offset=STARTS[number]).clamp_min(0)
         alpha = max(1 / (number + 1), 0.1)
         second = alpha * fitted + (1 - alpha) * second
         output = denoiser.output(given)
@@ -53,11 +53,9 @@ def test_a_frame_is_accumulated_fitted_and_accumulated_again() -> None:
 
 def test_blocks_begin_in_sixteen_places() -> None:
     """Half a block before the image, and an offset of the table; all even, and each another one."""
-    places = [_start(number, 32) for number in range(16)]
-    assert places[:3] == [(30, 30), (22, 12), (2, 24)]
-    assert len(set(places)) == 16
-    assert all(0 <= start < 32 and start % 2 == 0 for place in places for start in place)
-    assert [_start(number, 32) for number in range(16, 32)] == places
+    assert STARTS[:3] == [(30, 30), (22, 12), (2, 24)]
+    assert len(set(STARTS)) == 16
+    assert all(0 <= start < 32 and start % 2 == 0 for place in STARTS for start in place)
 
 
 def test_images_of_a_batch_may_be_at_different_frames() -> None:
