@@ -36,12 +36,12 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network
 from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.recurrent import from_before, to_be_kept
 from mcdenoise.nn.inputs import features_of
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.nn.unet import Head, UNet
@@ -86,7 +86,7 @@ class Anf(Network):
         light = with_carried(frame).to(frame.color.dtype)
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
-        found, known, notes = from_before(frame, state, channels=sum(sizes), keeper="anf")
+        found, known, notes = reprojected(frame, state, sum(sizes), "anf")
         result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
 
         unet_input = torch.cat([embedded, embedded_before], 1)
@@ -109,7 +109,7 @@ class Anf(Network):
                 kernel_size=KERNEL_SIZE,
                 dilation=1 << k,
             )
-        kept = to_be_kept(frame, torch.cat([image, mean, embedded_mean, features], 1))
+        kept = Past.of(frame, torch.cat([image, mean, embedded_mean, features], 1))
         return answered(frame, image).noted(*notes, Note("samples", describe_samples(frame))), kept
 
     def embedded(self, frame: Frame) -> Tensor:

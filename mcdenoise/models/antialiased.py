@@ -5,33 +5,18 @@ Karis 2014, "High-Quality Temporal Supersampling"; with the settings of Koskela 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Output, State
-from mcdenoise.models._motion import has_motion, motion_unless_still
-from mcdenoise.models._state import own_pair, own_state
+from mcdenoise.models._state import own_pair
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import reproject
 
 _GAMMA = 2.2
-
-
-class Shown(NamedTuple):
-    """State after a frame.
-
-    Args:
-        image: ``(B, 3, H, W)`` the result, gamma-mapped.
-        view_projection: ``(B, 4, 4)`` camera of the frame.
-    """
-
-    image: Tensor
-    view_projection: Tensor | None
 
 
 class Antialiased(Wrapper):
@@ -64,25 +49,16 @@ class Antialiased(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         inner, shown = own_pair(state, "antialiased")
-        before = own_state(shown, Shown, frame)
         output, inner = self.inner(frame, inner)
         image = _mapped(output.image)
-        result = image
-        if before is not None and before.image.shape == image.shape:
-            result = self._blended(image, before, frame)
-        after = inner, Shown(result, frame.view_projection)
+        before, weight, _ = reprojected(frame, shown, 3, "antialiased")
+        low, high = _range(_to_ycocg(image))
+        clamped = torch.minimum(torch.maximum(_to_ycocg(before), low), high)
+        blended = torch.lerp(_to_rgb(clamped), image, self.alpha).clamp_min(0)
+        result = torch.where(weight > 0, blended, image)
+        after = inner, Past.of(frame, result, surfaces=False)
         stages = {**output.stages, "denoised": output.image}
         return output._replace(image=_unmapped(result), stages=stages), after
-
-    def _blended(self, image: Tensor, before: Shown, frame: Frame) -> Tensor:
-        if not has_motion(frame, before.view_projection):
-            return image
-        motion = motion_unless_still(frame, before.view_projection)
-        previous, weight = reproject(before.image, motion)
-        low, high = _range(_to_ycocg(image))
-        clamped = torch.minimum(torch.maximum(_to_ycocg(previous), low), high)
-        blended = torch.lerp(_to_rgb(clamped), image, self.alpha).clamp_min(0)
-        return torch.where(weight > 0, blended, image)
 
 
 def _mapped(image: Tensor) -> Tensor:

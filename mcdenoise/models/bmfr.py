@@ -38,14 +38,14 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
+from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._motion import has_motion, motion_unless_still, surface_before
 from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
-from mcdenoise.ops import Surface, block_regression, reproject
+from mcdenoise.ops import block_regression
 from mcdenoise.ops.regression import BLOCK
 
 # Offsets of the first block of a frame, (x, y) in pixels for blocks of 32; half a block is subtracted from both.
@@ -61,15 +61,11 @@ class History(NamedTuple):
     """State of a shot.
 
     Args:
-        images: ``(B, 3 + C, H, W)`` fitted and accumulated color, followed by layers and alpha.
-        surface: surface of the previous frame.
-        view_projection: ``(B, 4, 4)`` camera of the previous frame.
+        past: its image is the fitted and accumulated color, followed by layers and alpha.
         number: ``(B, 1, 1, 1)`` number of the next frame, modulo 16.
     """
 
-    images: Tensor
-    surface: Surface
-    view_projection: Tensor | None
+    past: Past
     number: Tensor
 
 
@@ -113,10 +109,15 @@ class Bmfr(nn.Module):
         number = torch.zeros_like(color[:, :1, :1, :1]) if history is None else history.number
         images = self._fitted(frame, light, number)
         fitted = images[:, :3]
-        if history is not None:
-            images = self._accumulated(frame, images, history)
-        surface = Surface(frame.position, frame.normal)
-        after = History(images, surface, frame.view_projection, (number + 1) % len(_OFFSETS))
+        # Over the taps and with the length of the first accumulation.
+        before, weight, _ = reprojected(
+            frame, history and history.past, light.shape[1], "bmfr", rule="bmfr", **self.limits
+        )
+        assert frame.length is not None
+        alpha = torch.where(weight > 0, (1 / frame.length).clamp_min(self.second_alpha), 1)
+        images = torch.lerp(before.to(images.dtype), images, alpha.to(images.dtype))
+        kept = Past.of(frame, images)
+        after = None if kept is None else History(kept, (number + 1) % len(_OFFSETS))
         return answered(frame, images)._replace(stages={"fitted": fitted}), after
 
     def _fitted(self, frame: Frame, images: Tensor, number: Tensor) -> Tensor:
@@ -130,17 +131,6 @@ class Bmfr(nn.Module):
         fitted = block_regression(image, guide, squares=3)
         height, width = frame.size
         return _moved_back(_moved_back(fitted, rows, -2, height), columns, -1, width).clamp_min(0)
-
-    def _accumulated(self, frame: Frame, images: Tensor, history: History) -> Tensor:
-        """Accumulate with the previous result, over the taps and with the length of the first accumulation."""
-        if not has_motion(frame, history.view_projection):
-            return images
-        motion = motion_unless_still(frame, history.view_projection)
-        surface = surface_before(frame)._replace(depth=None)
-        before, weight = reproject(history.images, motion, surface, history.surface, rule="bmfr", **self.limits)
-        assert frame.length is not None
-        alpha = torch.where(weight > 0, (1 / frame.length).clamp_min(self.second_alpha), 1)
-        return torch.lerp(before, images, alpha.to(images.dtype))
 
 
 def _moved(image: Tensor, starts: Tensor, axis: int) -> Tensor:

@@ -40,7 +40,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -48,15 +48,14 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._motion import has_motion, motion_unless_still
 from mcdenoise.models._registry import register_model
-from mcdenoise.models._state import own_state
 from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
-from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition, reproject
+from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition
 from mcdenoise.ops._window import corner, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
@@ -68,23 +67,6 @@ _SLOPE = 0.3  # of the leaky ReLUs
 # Names and channels of the predictions at the finest scale, in order, and at each coarser one: 57 and 41 channels.
 _FINE = {"splat": _SPLAT, "previous": _SPLAT, "mu": 1, "lambda": 1, "partition": LEVELS}
 _COARSE = {"splat": _SPLAT, "upsample": _UPSAMPLE}
-
-
-class History(NamedTuple):
-    """State after a frame. Zeros are the state before the first frame.
-
-    Args:
-        radiance: ``(B, 3 + C, H, W)`` exponential mean; C is 0, or the channels of layers and alpha and one channel of
-            ones, whose result is the sum of all weights.
-        image: ``(B, 3 + C, H, W)`` result, with the same channels.
-        features: ``(B, 32, H, W)`` exponential mean.
-        view_projection: ``(B, 4, 4)`` camera of the frame.
-    """
-
-    radiance: Tensor
-    image: Tensor
-    features: Tensor
-    view_projection: Tensor | None
 
 
 class ConvUNet(nn.Module):
@@ -217,11 +199,11 @@ class Nppd(nn.Module):
         dtype = torch.promote_types(frame.color.dtype, torch.float32)
         radiance, others = frame.color.to(dtype), carried(frame)
         if others is not None:
+            # The result of the ones is the sum of all weights.
             radiance = torch.cat([radiance, others.to(dtype), torch.ones_like(radiance[:, :1])], 1)
-        state = own_state(state, History, frame, channels=radiance.shape[1])
-        reset = self._reset(frame, state)
-        warped, history = self._warped(frame, None if reset else state, radiance)  #                                1.
-        mean_before, image_before, features_before = warped
+        sizes = [radiance.shape[1], radiance.shape[1], FEATURES]
+        warped, _, notes = reprojected(frame, state, sum(sizes), "nppd")  #                                         1.
+        mean_before, image_before, features_before = warped.to(dtype).split(sizes, 1)
         features = self._encoded(frame, dtype)  #                                                                   2.
         both = torch.cat([mean_before[:, :3], radiance[:, :3]], 1)
         # As in Tiled, there is a mirror image around the image, except in training.
@@ -240,29 +222,8 @@ class Nppd(nn.Module):
         stages = {"accumulated": radiance[:, :3].to(frame.color.dtype)}
         result = image[:, :3].to(frame.color.dtype)
         output = answered(frame, result, None if others is None else _mean(image[:, 3:]))._replace(stages=stages)
-        output = output.noted(Note("history", reset, value=history), Note("samples", describe_samples(frame)))
-        keeps = frame.hints.keep_all or not frame.hints.last
-        return output, History(radiance, image, features, frame.view_projection) if keeps else None
-
-    def _reset(self, frame: Frame, before: History | None) -> str:
-        """Why the history is discarded; empty if it is used."""
-        if before is None:
-            return "first frame"
-        if before.radiance.shape[0] != len(frame.color) or before.radiance.shape[2:] != frame.color.shape[2:]:
-            return "size change"
-        return "" if has_motion(frame, before.view_projection) else "no motion"
-
-    def _warped(self, frame: Frame, before: History | None, radiance: Tensor) -> tuple[Sequence[Tensor], Tensor | None]:
-        """Previous mean radiance, result and features, reprojected to this frame, 0 where there is no history.
-
-        Also the fraction of the pixels that have one.
-        """
-        channels = [radiance.shape[1], radiance.shape[1], FEATURES]
-        if before is None:
-            return radiance.new_zeros(len(radiance), sum(channels), *frame.size).split(channels, 1), None
-        motion = motion_unless_still(frame, before.view_projection)
-        warped, weight = reproject(torch.cat(before[:3], 1).to(radiance.dtype), motion)
-        return warped.split(channels, 1), weight.mean()
+        kept = Past.of(frame, torch.cat([radiance, image, features], 1), surfaces=False)
+        return output.noted(*notes, Note("samples", describe_samples(frame))), kept
 
     def _encoded(self, frame: Frame, dtype: torch.dtype) -> Tensor:
         """The mean of the samples' features."""

@@ -40,13 +40,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame, tells_motion
+from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
-from mcdenoise.models.recurrent import Before, from_before, to_be_kept
 from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.ops import upsample
@@ -64,7 +64,7 @@ class Memory(NamedTuple):
     """
 
     hidden: tuple[Tensor, ...]
-    before: Before
+    before: Past
 
 
 class _Recurrent(nn.Module):
@@ -131,7 +131,7 @@ class Rae(nn.Module):
         maximum = torch.log1p(color.amax((1, 2, 3), keepdim=True))
         x = without_border(x, border)
         image = torch.expm1(torch.minimum(x.to(color.dtype).clamp_min(0), maximum))
-        kept = to_be_kept(frame, torch.zeros_like(color[:, :1]))
+        kept = Past.of(frame, torch.zeros_like(color[:, :1]))
         return Output(image, notes=notes), None if kept is None else Memory(after, kept)
 
 
@@ -171,7 +171,7 @@ def _recalled(frame: Frame, memory: Memory | None) -> tuple[list[Tensor | None],
         return nothing, (Note("history", "first frame" if memory is None else "size change"),)
     if not tells_motion(frame.buffers):
         return list(memory.hidden), ()
-    _, weight, notes = from_before(frame, memory.before, channels=1)
+    _, weight, notes = reprojected(frame, memory.before, 1, "rae")
     goes_on = weight.mean((1, 2, 3), keepdim=True) >= CUT_FRACTION
     if not notes[0].reason:
         notes = (*notes, Note("history", "cut", (~goes_on.any()).float(), weight.mean(), otherwise=""))

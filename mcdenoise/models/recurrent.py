@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._interface import Model, Note, Output, State
-from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
-from mcdenoise.models._state import own_state
+from mcdenoise.models._history import Past, reprojected
+from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface, demodulate, remodulate, reproject, resample
+from mcdenoise.ops import demodulate, remodulate
 
 # Keys in ``frame.extra``: the reprojected previous image, and its weight, the fraction that shows the same surface.
 PREVIOUS, PREVIOUS_WEIGHT = "previous", "previous_weight"
 PREVIOUS_LIGHT = "previous_light"  # the previous image with the albedo of this frame
-_ROUNDED = 8  # largest rounding error of the weight of all four taps, which is 1, in units of eps
-
-
-class Before(NamedTuple):
-    """State after a frame. Zeros are the state before the first frame: their weight is 0.
-
-    Args:
-        image: ``(B, C, H, W)`` the channels to reproject; for :class:`Recurrent` 6: the method's image, and the same
-            demodulated.
-        weight: ``(B, 1, 1, 1)`` 1, or 0 if there was no frame.
-        surface: surface of the frame.
-        view_projection: ``(B, 4, 4)`` camera of the frame.
-    """
-
-    image: Tensor
-    weight: Tensor
-    surface: Surface
-    view_projection: Tensor | None
 
 
 class Recurrent(Wrapper):
@@ -73,7 +52,8 @@ class Recurrent(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
-        image, weight, notes = from_before(frame, state, channels=6, sharp=True)
+        # The image, and the same demodulated.
+        image, weight, notes = reprojected(frame, state, 6, "recurrent", sharp=True)
         image, light = image.split(3, 1)
         albedo = frame.buffer(self.albedo)
         light = light if albedo is None else remodulate(light, albedo)
@@ -81,66 +61,4 @@ class Recurrent(Wrapper):
         handed = frame.replace(extra={**frame.extra, **before})
         output, _ = self.inner(handed)
         light = output.image if albedo is None else demodulate(output.image, albedo)
-        return output.noted(*notes), to_be_kept(frame, torch.cat([output.image, light], 1))
-
-
-def to_be_kept(frame: Frame, image: Tensor) -> Before | None:
-    """The state for the next frame from an image ``(B, C, H, W)`` of this frame; ``None`` after the last frame."""
-    if not _keeps(frame):
-        return None
-    surface = Surface(frame.position, frame.normal, frame.depth)
-    return Before(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
-
-
-def from_before(
-    frame: Frame, state: State, channels: int, keeper: str = "recurrent", *, sharp: bool = False
-) -> tuple[Tensor, Tensor, tuple[Note, ...]]:
-    """Reproject the previous image to this frame.
-
-    Args:
-        frame: with a depth, if it can be computed (:meth:`mcdenoise.frame.Frame.with_depth`).
-        state: result of :func:`to_be_kept`, or ``None``.
-        channels: number of channels of the image.
-        keeper: name of the method for messages.
-        sharp: whether pixels whose four nearest show the same surface are resampled by bicubic interpolation.
-
-    Returns:
-        ``(B, channels, H, W)`` image, and ``(B, 1, H, W)`` in [0, 1] the fraction that shows the same surface; both are
-        zero in a first frame, after a change of the image size, and without motion. Notes about the history.
-
-    Raises:
-        InputError: the state belongs to another method.
-    """
-    before = own_state(state, Before, frame, channels=channels, keeper=keeper)
-    shape = (frame.color.shape[0], channels, *frame.size)
-    if before is None:
-        return _nothing(frame, shape, "first frame")
-    if before.image.shape != shape:
-        return _nothing(frame, shape, "size change")
-    if not has_motion(frame, before.view_projection):
-        return _nothing(frame, shape, "no motion")
-    motion = motion_unless_still(frame, before.view_projection)
-    found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
-    if sharp and motion is not None:
-        whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps
-        found = torch.where(whole, resample(before.image, motion), found)
-    weight = weight * before.weight
-    return found, weight, _notes(frame, "", weight.mean())
-
-
-def _nothing(frame: Frame, shape: tuple[int, ...], reset: str) -> tuple[Tensor, Tensor, tuple[Note, ...]]:
-    """The result of :func:`from_before` without a previous image, for the reason ``reset``."""
-    return frame.color.new_zeros(shape), torch.zeros_like(frame.color[:, :1]), _notes(frame, reset, 0.0)
-
-
-def _keeps(frame: Frame) -> bool:
-    return frame.hints.keep_all or not frame.hints.last
-
-
-def _notes(frame: Frame, reset: str, history: float | Tensor) -> tuple[Note, ...]:
-    keeps = _keeps(frame)
-    return (
-        Note("history", reset, value=history),
-        Note("reproject", reset or "the image of the frame before", float(reset != "")),
-        Note("remember", "for the next frame" if keeps else "last frame", float(not keeps)),
-    )
+        return output.noted(*notes), Past.of(frame, torch.cat([output.image, light], 1))

@@ -1,0 +1,113 @@
+"""What a method keeps of a frame, and what the next frame sees of it: motion, surfaces, changes of size, the state."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Note, State
+from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
+from mcdenoise.models._state import own_state
+from mcdenoise.ops import Surface, reproject, resample
+
+_ROUNDED = 8  # largest rounding error of the weight of all four taps, which is 1, in units of eps
+
+
+class Past(NamedTuple):
+    """Images of a frame for the next one. Zeros stand for no frame: their weight is 0.
+
+    Args:
+        image: ``(B, C, H, W)`` the channels to reproject.
+        weight: ``(B, 1, 1, 1)`` 1, or 0 if there was no frame.
+        surface: what the frame shows; empty if surfaces are not to be compared.
+        view_projection: ``(B, 4, 4)`` camera of the frame.
+    """
+
+    image: Tensor
+    weight: Tensor
+    surface: Surface
+    view_projection: Tensor | None
+
+    @staticmethod
+    def of(frame: Frame, image: Tensor, *, surfaces: bool = True) -> Past | None:
+        """Keep an image of a frame, and its surface; ``None`` after the last frame."""
+        if not _keeps(frame):
+            return None
+        surface = Surface(frame.position, frame.normal, frame.depth) if surfaces else Surface()
+        return Past(image, torch.ones_like(image[:, :1, :1, :1]), surface, frame.view_projection)
+
+
+class Reprojected(NamedTuple):
+    """The frame before, seen from this one.
+
+    Args:
+        image: ``(B, C, H, W)``; zero where there is nothing.
+        weight: ``(B, 1, H, W)`` in [0, 1], the fraction that shows the same surface.
+        notes: about the history.
+    """
+
+    image: Tensor
+    weight: Tensor
+    notes: tuple[Note, ...]
+
+
+def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None) -> str:
+    """Why a frame cannot continue a history; empty if it can.
+
+    Args:
+        frame: the current frame.
+        image: any image of the frame before; ``None`` if there was none.
+        view_projection: camera of the frame before.
+    """
+    if image is None:
+        return "first frame"
+    if image.shape[2:] != frame.color.shape[2:]:
+        return "size change"
+    return "" if has_motion(frame, view_projection) else "no motion"
+
+
+def reprojected(
+    frame: Frame, state: State, channels: int, keeper: str, *, sharp: bool = False, **rule: Any
+) -> Reprojected:
+    """Reproject the images of the frame before to this frame.
+
+    Args:
+        frame: with a depth, if it can be computed (:meth:`mcdenoise.frame.Frame.with_depth`).
+        state: result of :meth:`Past.of`, or ``None``.
+        channels: number of channels of the image.
+        keeper: name of the method for messages.
+        sharp: whether pixels whose four nearest show the same surface are resampled by bicubic interpolation.
+        rule: how surfaces are compared, see :func:`mcdenoise.ops.reproject`; by default as far as both have them.
+
+    Raises:
+        InputError: the state belongs to another method.
+    """
+    before = own_state(state, Past, frame, channels=channels, keeper=keeper)
+    reset = reset_of(frame, *((None, None) if before is None else (before.image, before.view_projection)))
+    if before is None or reset:
+        shape = (frame.color.shape[0], channels, *frame.size)
+        none = torch.zeros_like(frame.color[:, :1])
+        return Reprojected(frame.color.new_zeros(shape), none, _notes(frame, reset, 0.0))
+    motion, surfaces = motion_unless_still(frame, before.view_projection), (surface_before(frame), before.surface)
+    found, weight = reproject(before.image, motion, *(surfaces if rule else comparable(*surfaces)), **rule)
+    if sharp and motion is not None:
+        whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps
+        found = torch.where(whole, resample(before.image, motion), found)
+    weight = weight * before.weight
+    return Reprojected(found, weight, _notes(frame, "", weight.mean()))
+
+
+def _keeps(frame: Frame) -> bool:
+    return frame.hints.keep_all or not frame.hints.last
+
+
+def _notes(frame: Frame, reset: str, history: float | Tensor) -> tuple[Note, ...]:
+    keeps = _keeps(frame)
+    return (
+        Note("history", reset, value=history),
+        Note("reproject", reset or "the image of the frame before", float(reset != "")),
+        Note("remember", "for the next frame" if keeps else "last frame", float(not keeps)),
+    )
