@@ -18,9 +18,10 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
+from mcdenoise.models._history import reset_of
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._motion import motion_to_previous, surface_before
+from mcdenoise.models._motion import motion_unless_still, surface_before
 from mcdenoise.models._published import demodulated
 from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
@@ -74,7 +75,8 @@ class Svgf(nn.Module):
         entering = with_carried(frame)
         history = own_state(state, History, frame, channels=entering.shape[1])
         normal, depth = frame.normal, frame.depth
-        reset, motion = self._reset(frame, history)
+        reset = reset_of(frame, history and history.length, history and history.view_projection)
+        motion = None if history is None or reset else motion_unless_still(frame, history.view_projection)
         light, moments, length = self._accumulate(frame, entering, None if reset else history, motion)
         variance = variance_of(moments, length, frame)
         filtered, kept = light, light
@@ -86,15 +88,6 @@ class Svgf(nn.Module):
         after = History(kept, moments, length, surface, frame.view_projection)
         output = answered(frame, filtered).noted(Note("history", reset))
         return output._replace(stages={"accumulated": light[:, :3]}), after
-
-    def _reset(self, frame: Frame, history: History | None) -> tuple[str, Tensor | None]:
-        """Why the history is discarded, empty if it is used; and the motion since the frame before."""
-        if history is None:
-            return "first frame", None
-        motion = motion_to_previous(frame, history.view_projection)
-        if history.length.shape != frame.color[:, :1].shape:
-            return "size change", motion
-        return "" if motion is not None else "no motion", motion
 
     def _accumulate(
         self, frame: Frame, light: Tensor, history: History | None, motion: Tensor | None
