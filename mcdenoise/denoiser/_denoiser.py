@@ -1,98 +1,55 @@
-"""Denoising frame by frame, with a history; and denoising of a single image from arrays to an array."""
+"""The denoiser of a shot: it prepares each frame, runs the method, and keeps the state."""
 
 from __future__ import annotations
 
-import functools
-import inspect
 import os
-import reprlib
-import threading
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Collection, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import NoneType
-from typing import Any, Concatenate, Literal, ParamSpec, TypeVar, get_args
-from weakref import WeakKeyDictionary
+from typing import Any, Literal, get_args
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError, did_you_mean, level_of_caller
-from mcdenoise.frame import MOTION, OF_RENDERERS, Frame, Hints, Layout, tells_motion
+from mcdenoise.denoiser._choice import suitable_model
+from mcdenoise.denoiser._frames import dtype_of, explained, prepared
+from mcdenoise.denoiser._settings import check_kind, check_settings, usable_device
+from mcdenoise.denoiser._turns import in_turn, started
+from mcdenoise.denoiser._watch import REPEATED, Watch
+from mcdenoise.errors import InputError, level_of_caller
+from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
 from mcdenoise.models import (
     DEFAULT,
-    EXACT,
-    FILTERED,
     Model,
-    Note,
     Output,
     State,
     computing_in,
     create_model,
     fastest_precision,
-    find_model,
     has_network,
 )
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
-from mcdenoise.models._layers import REST, alpha_of, closed, completed, opened
+from mcdenoise.models._layers import REST, alpha_of, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._times import Times
-from mcdenoise.models._void import Void, with_void, without_void
+from mcdenoise.models._void import with_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
 from mcdenoise.models._wrapper import name_of
-from mcdenoise.motion import MOTION_PAIRS, Seen, doubt_motion, seen_in
-from mcdenoise.noise import noise_is_repeated, noise_of, thinned
-from mcdenoise.sampling import has_exact_features
+from mcdenoise.noise import noise_of
 
 AskedPrecision = Literal["auto", "float32", "bfloat16"]
 
 # Level of noise up to which bfloat16 makes errors larger: by 41 % at 0.001, 6 % at 0.006, 2 % at 0.02, 1 % at 0.06
 # (oidn_tuned on even surfaces, where they are largest).
 _ROUNDED = 0.03
-# Level of noise of frames with some eight samples a pixel; training/README.md has the errors of both models.
-_MANY_SAMPLES = 0.1
-
-
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
-# The locks are not in the denoisers, which can be copied to another process.
-_locks: WeakKeyDictionary[Denoiser, threading.RLock] = WeakKeyDictionary()
-# The process, if it has denoised frames, and so may have started threads of torch.
-_started: set[int] = set()
-
-
-def _in_turn(
-    method: Callable[Concatenate[Denoiser, _Arguments], _Result],
-) -> Callable[Concatenate[Denoiser, _Arguments], _Result]:
-    """Run a denoiser's methods in one thread at a time."""
-
-    @functools.wraps(method)
-    def alone(denoiser: Denoiser, /, *arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
-        with _locks.setdefault(denoiser, threading.RLock()):
-            return method(denoiser, *arguments, **settings)
-
-    return alone
-
-
-def _after_fork() -> None:
-    """Make a forked process independent of its parent's threads: it has none of them, and would wait for them."""
-    _locks.clear()
-    if _started:
-        torch.set_num_threads(1)
-    _started.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
 
 
 class Denoiser:
@@ -167,17 +124,13 @@ class Denoiser:
         wrap: bool = False,
         **settings: Any,
     ) -> None:
-        _check_kind("weights", weights, (str, Path, NoneType), "a path")
-        _check_kind("tile", tile, (int, NoneType), "a whole number of pixels")
-        _check_kind("max_memory", max_memory, (int, float, NoneType), "a number of GB")
-        for name, switch in (
-            ("keep_all", keep_all),
-            ("differentiable", differentiable),
-            ("alpha", alpha),
-            ("wrap", wrap),
-        ):
-            _check_kind(name, switch, (bool,), "True or False")
-        self.device = _device(device)
+        check_kind("weights", weights, (str, Path, NoneType), "a path")
+        check_kind("tile", tile, (int, NoneType), "a whole number of pixels")
+        check_kind("max_memory", max_memory, (int, float, NoneType), "a number of GB")
+        switches = {"keep_all": keep_all, "differentiable": differentiable, "alpha": alpha, "wrap": wrap}
+        for name, switch in switches.items():
+            check_kind(name, switch, (bool,), "True or False")
+        self.device = usable_device(device)
         known = get_args(AskedPrecision)
         if precision not in known:
             raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
@@ -196,7 +149,7 @@ class Denoiser:
         # A Model, or None until the first frame has picked one.
         self.model: Any = None
         if model is None:
-            _check_settings(DEFAULT, settings)
+            check_settings(DEFAULT, settings, of=Denoiser)
             check_limits(tile, max_memory, self.device)
             self.precision, self._why_precision = self._chosen()
         else:
@@ -207,7 +160,7 @@ class Denoiser:
         """Make the model and what depends on it."""
         name, of_zoo = str(model), isinstance(model, str) and ":" not in model
         if isinstance(model, str):
-            _check_settings(model, self._given)
+            check_settings(model, self._given, of=Denoiser)
             model = create_model(model, pretrained=weights is None, weights=weights, **self._given)
         elif self._given or weights is not None:
             names = ", ".join([*self._given, *(["weights"] if weights else [])])
@@ -220,7 +173,7 @@ class Denoiser:
         self.precision, self._why_precision = self._chosen(of_zoo=of_zoo)
         self._tiles = Division(self.model, *self._limits, self.device)
 
-    @_in_turn
+    @in_turn
     def pick(self, frame: Frame | None) -> None:
         """Choose the model by a frame, if none was named or chosen before; otherwise the first frame does so.
 
@@ -251,7 +204,7 @@ class Denoiser:
             return fastest_precision(self.device)
         return Chosen("float32", "nothing is learnt")
 
-    @_in_turn
+    @in_turn
     def reset(
         self,
         buffers: Collection[str] | None = None,
@@ -272,16 +225,12 @@ class Denoiser:
             InputError: frames of this size cannot be denoised within ``max_memory``; the message says how much is
                 needed.
         """
-        _check_kind("frames", frames, (int, NoneType), "a whole number")
-        _check_kind("layers", layers, (int,), "a whole number")
+        check_kind("frames", frames, (int, NoneType), "a whole number")
+        check_kind("layers", layers, (int,), "a whole number")
         self._state: State = None
-        self._doubted = False
-        # The state that the last frame continued, and a few of its pixels.
+        # The state that the last frame continued.
         self._before: State = None
-        self._seen: Frame | None = None
-        # What the next frame's motion is compared with, and how many frames are still examined.
-        self._compared: Seen | None = None
-        self._unseen = 1 + MOTION_PAIRS
+        self._watch, self._doubted = Watch(), False
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
@@ -303,7 +252,7 @@ class Denoiser:
             self.has_room_ahead = self._tiles.has_room_ahead(shot) and self.has_room_ahead
 
     @property
-    @_in_turn
+    @in_turn
     def report(self) -> FrameReport:
         """The report of the last frame. On a GPU, this waits until the frame is done.
 
@@ -314,7 +263,7 @@ class Denoiser:
         self._settle()
         return self._report
 
-    @_in_turn
+    @in_turn
     def detach(self) -> None:
         """Detach the history from the graph, for truncated backpropagation: later ``backward`` ends here."""
         self._state, self._before = pytree.tree_map_only(Tensor, Tensor.detach, (self._state, self._before))
@@ -342,7 +291,7 @@ class Denoiser:
                 history is that of the previous frame. On a GPU, for which the call does not wait, invalid values are
                 reported by the next call or by ``report``, and the history is reset.
         """
-        _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
+        check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
         return self._step(frame.replace(layers={}) if frame.layers else frame, stages=False).image
 
     def output(self, frame: Frame, *, stages: bool = True) -> Output:
@@ -364,20 +313,18 @@ class Denoiser:
         """
         return self._step(frame, stages=stages)
 
-    @_in_turn
+    @in_turn
     def _step(self, frame: Frame, *, stages: bool) -> Output:
-        _check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
-        _started.add(os.getpid())
+        check_kind("frame", frame, (Frame,), "a Frame, such as Frame(color=...)")
+        started.add(os.getpid())
         self._settle()
         self._report = report = FrameReport(precision=self._why_precision)
         self._times = times = Times(self.device)
         with nullcontext() if self.differentiable else torch.no_grad():
             with times.of("validate"):
                 if frame.color.is_meta and self.device.type != "meta":
-                    raise InputError(
-                        "frame: expected tensors with values, found tensors of the device meta, without any"
-                    )
-                given, dtype = frame, self._dtype(frame)
+                    raise InputError("frame: expected tensors with values, found those of the device meta, without any")
+                given, dtype = frame, dtype_of(frame, self.model, differentiable=self.differentiable)
                 hints = Hints(
                     last=self._is_last(),
                     alone=self._frames == 1,
@@ -387,19 +334,24 @@ class Denoiser:
                 )
                 whole = frame.to(self.device).to(dtype).replace(hints=hints)
                 whole = wrapped(whole) if self.wrap else whole
-                frame, void = self._prepared(whole, report)
+                frame, void = prepared(whole, report, self._doubt)
                 if self.model is None:
                     self.pick(frame)
                 report.model = self._picked
-                # A depth by way of the camera says nothing about this camera.
-                compared = self._examined(frame.replace(depth=frame.depth if given.depth is not None else None))
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 precision, report.tiles = self._planned(frame, report)
-                before, seen = self._continued(frame, report)
+                # A depth by way of the camera says nothing about this camera.
+                shown = frame.replace(depth=frame.depth if given.depth is not None else None)
+                before, watch = self._continued(shown, report)
             noisy = frame.color
             computing = computing_in(precision, self.device)
-            with computing, self._explained(dtype), times.of(self._name), times.of_modules(self.model, self._name):
+            with (
+                computing,
+                explained(self.model, dtype),
+                times.of(self._name),
+                times.of_modules(self.model, self._name),
+            ):
                 output, state = checked_step(self.model, frame, before, self._shape, report.ask)
             with times.of("validate"):
                 # A renderer may write its next frame into the same buffers, and a user may change an image in place.
@@ -418,64 +370,29 @@ class Denoiser:
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
         self._layers = self._carried(frame)
-        self._before, self._seen = (None, None) if seen is None else (before, seen)
-        self._compared, self._unseen = compared, max(self._unseen - 1, 0)
+        self._before, self._watch = None if watch.pixels is None else before, watch
         return result
 
-    def _prepared(self, frame: Frame, report: FrameReport) -> tuple[Frame, Void]:
-        """The frame with valid values, void pixels filled, and layers that sum to its color."""
-        filled, void = without_void(frame)
-        if void.mask is not None:
-            report.add([Note("void", "filled from around, and kept")])
-        return closed(self._inspected(filled, report).with_depth(), report.ask), void
-
-    def _inspected(self, frame: Frame, report: FrameReport) -> Frame:
-        """The frame with valid values. An invalid one raises an error, on a GPU only when the numbers have arrived."""
-        if at_hand(self.device):
-            frame, report.repairs, _ = frame.inspect()
-            self._doubt(report.repairs.doubt)
-            return frame
-        repaired = frame.repaired()
-
-        def judge(numbers: Sequence[float]) -> None:
-            report.repairs = repaired.judge(numbers)
-            self._doubt(report.repairs.doubt)
-
-        report.ask(repaired.numbers, judge)
-        return repaired.frame
-
-    def _continued(self, frame: Frame, report: FrameReport) -> tuple[State, Frame | None]:
-        """The state that a frame continues, and its pixels to compare the next one with.
+    def _continued(self, frame: Frame, report: FrameReport) -> tuple[State, Watch]:
+        """The state that a frame continues, and what is remembered of it; warns of wrong motion in the first frames.
 
         Where it repeats the noise of the frame before, it takes that frame's place in the history: equal noise counts
-        once. On a GPU, which is not read, and with ``keep_all`` this is not looked for.
+        once. On a GPU, which would have to be waited for, neither is looked for.
         """
-        watches = at_hand(self.device) and self.has_history(frame.buffers) and not self.keep_all
-        seen = thinned(frame) if watches else None
-        if seen is None or self._seen is None or not noise_is_repeated(frame, seen, self._seen):
-            # Before a network runs, so that it has the memory.
-            self._before = None
-            return self._state, seen
-        report.repeats = (
-            "the noise is that of the frame before, pixel by pixel, and counts once, as it does only on a CPU where "
-            "nothing moves; render each frame with its own seed"
+        follows = at_hand(self.device) and self.has_history(frame.buffers)
+        moves = bool(MOTION & (self.model.needs.buffers | self.model.needs.uses))
+        watch, repeats, doubt = self._watch.after(
+            frame, motion=follows and moves and self.warns, noise=follows and not self.keep_all
         )
-        self._doubt(report.repeats)
-        return self._before, seen
-
-    def _examined(self, frame: Frame) -> Seen | None:
-        """Warn of wrong motion in one of the first frames of a shot, and return what that of the next one needs.
-
-        Nothing is examined on a GPU, which would have to be waited for, nor for a method that uses no motion.
-        """
-        wanted = MOTION & (self.model.needs.buffers | self.model.needs.uses)
-        if not (self._unseen and self.warns and wanted and self.has_history(frame.buffers) and at_hand(self.device)):
-            return None
-        if not (doubt := doubt_motion(frame, self._compared)):
-            return seen_in(frame)
-        self._unseen = 0
-        warnings.warn(doubt, stacklevel=level_of_caller())
-        return None
+        if doubt:
+            warnings.warn(doubt, stacklevel=level_of_caller())
+        if repeats:
+            report.repeats = REPEATED
+            self._doubt(report.repeats)
+            return self._before, watch
+        # Before a network runs, so that it has the memory.
+        self._before = None
+        return self._state, watch
 
     def _doubt(self, text: str) -> None:
         """Warn of changed light or equal noise, once a shot."""
@@ -490,7 +407,7 @@ class Denoiser:
             self._report.milliseconds = self._report.milliseconds or self._times.milliseconds()
         except InputError as error:
             self._state, self._shape, self._layers = None, (), ()
-            self._before = self._seen = None
+            self._before, self._watch = None, self._watch._replace(pixels=None)
             raise InputError(f"{error} (of the last frame, told a frame late; the history begins anew)") from error
 
     def _check_layers(self, frame: Frame) -> None:
@@ -505,34 +422,14 @@ class Denoiser:
         """Names of the channels that are accumulated together with the color."""
         return (*frame.layers, *(() if alpha_of(frame) is None else ("alpha",)))
 
-    @contextmanager
-    def _explained(self, dtype: torch.dtype) -> Iterator[None]:
-        """Add an explanation to the error of a model whose weights have a higher precision than its frame."""
-        try:
-            yield
-        except RuntimeError as error:
-            weights = list(self.model.parameters()) if isinstance(self.model, nn.Module) else []
-            if dtype == torch.float64 or all(each.dtype != torch.float64 for each in weights):
-                raise
-            raise InputError(
-                f"model: expected float32 weights for float32 frames, found float64 weights, with which it fails "
-                f"({' '.join(str(error).split())}); call its float(), or pass float64 frames with differentiable"
-            ) from error
-
-    def _dtype(self, frame: Frame) -> torch.dtype:
-        if self.model is None:
-            return torch.float32
-        exact = self.differentiable and frame.color.dtype == torch.float64
-        weights = self.model.parameters() if isinstance(self.model, nn.Module) else ()
-        return torch.float64 if exact and all(each.dtype == torch.float64 for each in weights) else torch.float32
-
     def _planned(self, frame: Frame, report: FrameReport) -> tuple[Precision, str]:
         """The precision of a frame, and its tiles, in words.
 
         Raises:
             InputError: not even the smallest tiles fit.
         """
-        shot = self._shot(frame)
+        streaming, carried = self.has_history(frame.buffers), len(self._carried(frame))
+        shot = Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, frame.color.shape[0], carried)
         if self.precision == "bfloat16":
 
             def hear(levels: Sequence[float]) -> None:
@@ -548,144 +445,7 @@ class Denoiser:
                     return "float32", tiles
         return self.precision, self._tiles.divide(shot._replace(bfloat16=self.precision != "float32"))
 
-    def _shot(self, frame: Frame) -> Frames:
-        streaming = self.has_history(frame.buffers)
-        batch, carried = frame.color.shape[0], len(self._carried(frame))
-        return Frames(frame.size, frame.buffers, streaming, self.has_room_ahead, batch, carried)
-
     def _is_last(self) -> bool:
         """Whether no later frame can have a history."""
-        if self._frames is not None and self._count + 1 >= self._frames:
-            return True
-        return self._buffers is not None and not self.has_history(self._buffers)
-
-
-def suitable_model(frame: Frame | None, *, still: bool = False, cascade: bool = False) -> tuple[str, str]:
-    """The name of the model that suits a frame, and the reason in words.
-
-    ``cascaded_v2`` was trained on features without noise and one sample a pixel, and is best with a history;
-    ``oidn_tuned_exact`` was trained on features without noise and 1 to 64 samples. Files of a renderer have features
-    through a pixel filter, for which the others were trained.
-
-    Args:
-        frame: ``None`` for one that is known to have features through a filter.
-        still: whether it is the only frame of its shot.
-        cascade: whether a cascade is required, for the settings of its history.
-    """
-    exact = frame is not None and has_exact_features(frame)
-    if cascade:
-        return DEFAULT if exact else "cascaded_v3", "of the usual models, only cascades have settings of the history"
-    name, reason = FILTERED, "features may be noisy, or filtered over pixels"
-    if frame is not None and exact:
-        if not still and float(noise_of(frame.color, frame.albedo, frame.normal).level.amax()) > _MANY_SAMPLES:
-            return DEFAULT, "features have no noise, and the color of a sequence has much"
-        name, reason = EXACT, f"features have no noise, and the color {'is of a still' if still else 'has little'}"
-    return name, f"{reason}; oidn_temporal usually has a smaller error, but takes longer"
-
-
-def denoise(
-    color: ArrayLike,
-    *,
-    layout: Layout = "HWC",
-    albedo: ArrayLike | None = None,
-    normal: ArrayLike | None = None,
-    depth: ArrayLike | None = None,
-    model: str | Model | nn.Module | None = None,
-    device: torch.device | str = "cpu",
-    precision: AskedPrecision = "auto",
-    extra: Mapping[str, ArrayLike] | None = None,
-    **others: Any,
-) -> NDArray[np.float32]:
-    """Denoise a single image: arrays in, an array out.
-
-    The model is created in each call, and no state is kept. For the frames of a shot, which have a history, and for
-    many images use a :class:`Denoiser` and :meth:`mcdenoise.Frame.from_numpy`.
-
-    Args:
-        color: ``(H, W, 3)`` in the layout ``"HWC"``, ``(3, H, W)`` in ``"CHW"``, or one channel, also ``(H, W)``, which
-            is grey: scene-linear radiance of any float dtype. Pixels that are NaN, infinite, negative or above 1e16 are
-            replaced, see :class:`Denoiser`.
-        layout: layout of every array, including the result. It is never guessed: an array of another layout is
-            rejected.
-        albedo: like ``color``, in [0, 1]; this and the following buffers are optional.
-        normal: like ``color``, in [-1, 1].
-        depth: ``(H, W)``, or with a channel axis.
-        model: see :class:`Denoiser`, also for the default.
-        device: device to run on; the result is copied back from it.
-        precision: see :class:`Denoiser`.
-        extra: further buffers by name.
-        others: further buffers of :class:`mcdenoise.Frame`, such as ``position``, see
-            :meth:`mcdenoise.Frame.from_numpy`; further arguments of :class:`Denoiser`, such as ``weights``; and
-            settings of the model.
-
-    Returns:
-        The denoised image, float32 whatever the dtype of ``color``, in the same layout and with as many channels,
-        contiguous, in its own memory.
-
-    Raises:
-        InputError: an array has another layout, size or number of channels, holds no floats or illegal values, or the
-            model lacks a buffer or has no such setting; the message names it.
-
-    Example:
-        >>> noisy, albedo = np.random.rand(24, 32, 3), np.full((24, 32, 3), 0.5)
-        >>> clean = denoise(noisy, albedo=albedo, model="cascaded_v2_micro")
-        >>> clean.shape, clean.dtype
-        ((24, 32, 3), dtype('float32'))
-    """
-    settings = {name: value for name, value in others.items() if name not in OF_RENDERERS}
-    buffers = {name: value for name, value in others.items() if name in OF_RENDERERS}
-    frame = Frame.from_numpy(color, layout=layout, albedo=albedo, normal=normal, depth=depth, extra=extra, **buffers)
-    _check_settings(model or DEFAULT, settings, also={*OF_RENDERERS, *inspect.signature(denoise).parameters})
-    denoiser = Denoiser(model, device=device, precision=precision, **settings)
-    denoiser.reset(frames=1)
-    image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
-    # Raises an error for invalid values, which a GPU reports late.
-    denoiser._settle()
-    shape = np.shape(color)
-    if len(shape) == 2 or shape[-1 if layout == "HWC" else 0] == 1:
-        return np.ascontiguousarray(image.mean(0).reshape(shape))
-    return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))
-
-
-def _check_settings(model: object, given: Iterable[str], *, also: Collection[str] = ()) -> None:
-    """Refuse an argument by its name if nothing takes it; its value, which may be a large array, is not shown.
-
-    Args:
-        model: see :class:`Denoiser`. The settings of a model by the user are checked when it is created.
-        given: names of arguments that should be settings of the model.
-        also: names of buffers and arguments that the caller takes, too.
-    """
-    settings: Sequence[str] = ()
-    if isinstance(model, str):
-        if ":" in model:
-            return
-        parameters = inspect.signature(find_model(model).construct).parameters
-        if any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-            return
-        settings = list(parameters)
-    arguments = inspect.signature(Denoiser).parameters.keys() - {"settings"}
-    places = [*(["a buffer"] if also else []), "an argument of Denoiser"]
-    places += [f"a setting of model '{model}' ({', '.join(settings)})"] if settings else []
-    for name in given:
-        if name not in settings and name not in arguments:
-            near = did_you_mean(name, {*also, *arguments, *settings})
-            raise InputError(
-                f"argument '{name}': expected {' or '.join(places)}, found none of this name{near and '; '}{near}"
-            )
-
-
-def _check_kind(name: str, value: object, kinds: tuple[type, ...], expected: str) -> None:
-    # Python counts True and False as integers; here they are not.
-    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        raise InputError(f"{name}: expected {expected}, found {type(value).__name__} {reprlib.repr(value)}")
-
-
-def _device(device: torch.device | str) -> torch.device:
-    try:
-        device = torch.device(device)
-        torch.zeros((), device=device).item()
-    except (RuntimeError, AssertionError, ImportError, TypeError) as error:
-        raise InputError(
-            f"device '{device}': expected one that torch can use, found: {str(error).splitlines()[0]}"
-        ) from error
-    return device
+        ends = self._frames is not None and self._count + 1 >= self._frames
+        return ends or (self._buffers is not None and not self.has_history(self._buffers))
