@@ -68,6 +68,12 @@ class Output(NamedTuple):
         alpha = None if self.alpha is None else function(self.alpha)
         return Output(function(self.image), stages, layers, alpha, self.notes)
 
+    def lit(self, function: Callable[[Tensor], Tensor], *, stages: bool = True) -> Output:
+        """The same with a function of all light: of the image, the layers, and the stages unless they are dropped."""
+        layers = {name: function(layer) for name, layer in self.layers.items()}
+        kept = {name: function(image) for name, image in self.stages.items()} if stages else {}
+        return self._replace(image=function(self.image), stages=kept, layers=layers)
+
     def noted(self, *notes: Note) -> Output:
         """The same with these notes before its own."""
         return self._replace(notes=(*notes, *self.notes))

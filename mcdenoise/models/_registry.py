@@ -8,7 +8,7 @@ import importlib.util
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import Distribution, EntryPoint, distributions
@@ -102,6 +102,27 @@ def register_model(
         return constructor
 
     return enter
+
+
+def register_family(
+    constructor: Callable[..., Any],
+    description: str,
+    presets: Mapping[str, tuple[str, dict[str, Any]]],
+    *,
+    kind: Kind,
+    paper: str,
+) -> None:
+    """Register a constructor under several names.
+
+    Args:
+        constructor: of all of them.
+        description: what they have in common.
+        presets: for each name what it is beside that, and its settings.
+        kind: see :func:`register_model`.
+        paper: see :func:`register_model`.
+    """
+    for name, (about, settings) in presets.items():
+        register_model(name, f"{description}: {about}", kind=kind, paper=paper, **settings)(constructor)
 
 
 def list_models(pattern: str = "*") -> list[str]:

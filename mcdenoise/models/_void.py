@@ -10,7 +10,6 @@ color of the surface at a rim, is wrong. So where alpha is wanted too, a method 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -115,7 +114,7 @@ def with_void(output: Output, frame: Frame, void: Void) -> Output:
             surface = (alpha > 0) if mask is None else (alpha > 0) | mask
             multiplier = torch.where(surface, after, alpha).clamp(_LEAST, 1.0)
             multiplier = torch.where(void.divided, multiplier, 1)
-            output = _light(output, lambda image: image * multiplier)
+            output = output.lit(lambda image: image * multiplier)
             # A pixel that only noise left empty has the light of the surface.
             mask = None if mask is None else mask & ((after <= 0) | (alpha > 0))
     if mask is None:
@@ -204,9 +203,3 @@ def _islands(known: Tensor) -> Tensor:
             _, place = torch.unique(number, return_inverse=True)
             return torch.as_tensor(place).reshape(known.shape)
         number = after
-
-
-def _light(output: Output, function: Callable[[Tensor], Tensor]) -> Output:
-    layers = {name: function(layer) for name, layer in output.layers.items()}
-    stages = {name: function(image) for name, image in output.stages.items() if image.shape == output.image.shape}
-    return output._replace(image=function(output.image), layers=layers, stages={**output.stages, **stages})

@@ -133,8 +133,7 @@ class _NonNegative(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         output, state = self.inner(frame, state)
-        layers = {name: layer.clamp_min(0) for name, layer in output.layers.items()}
-        return output._replace(image=output.image.clamp_min(0), layers=layers), state
+        return output.lit(lambda image: image.clamp_min(0)), state
 
 
 @register_model(

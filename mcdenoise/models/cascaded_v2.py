@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +24,7 @@ from torch import Tensor, nn
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._registry import register_model
+from mcdenoise.models._registry import register_family
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.coarse_to_fine import CoarseToFine
@@ -219,17 +218,18 @@ def _cascade(
     return with_history(networks, alpha_min, anti_lag, tolerance, restore)
 
 
-_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("cascaded_v2", "width 40, 5x5 kernels", {"width": 40}),
-    ("cascaded_v2_small", "widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
-    ("cascaded_v2_tiny", "width 16, 3x3 kernels", {"width": 16, "kernel_size": 3}),
-    ("cascaded_v2_micro", "width 16, 3x3 kernels, half the resolution", {"width": 16, "kernel_size": 3, "half": True}),
+register_family(
+    _cascade,
+    "P+K with history, logarithms, three resolutions",
+    {
+        "cascaded_v2": ("width 40, 5x5 kernels", {"width": 40}),
+        "cascaded_v2_small": ("widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
+        "cascaded_v2_tiny": ("width 16, 3x3 kernels", {"width": 16, "kernel_size": 3}),
+        "cascaded_v2_micro": (
+            "width 16, 3x3 kernels, half the resolution",
+            {"width": 16, "kernel_size": 3, "half": True},
+        ),
+    },
+    kind="kernel",
+    paper="after DOI 10.1007/s00371-023-02951-6",
 )
-for _name, _about, _settings in _PRESETS:
-    register_model(
-        _name,
-        f"P+K with history, logarithms, three resolutions: {_about}",
-        kind="kernel",
-        paper="after DOI 10.1007/s00371-023-02951-6",
-        **_settings,
-    )(_cascade)

@@ -8,10 +8,8 @@ unless the light is diffuse and very noisy.
 
 from __future__ import annotations
 
-from typing import Any
-
 from mcdenoise.models._interface import Model
-from mcdenoise.models._registry import register_model
+from mcdenoise.models._registry import register_family
 from mcdenoise.models.cascaded_v2 import both_networks, with_history
 from mcdenoise.models.refined import Refined
 from mcdenoise.models.skipping import TOLERANCE
@@ -48,21 +46,18 @@ def _cascade(
     return with_history(networks, alpha_min, anti_lag, tolerance, restore)
 
 
-_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("cascaded_v3", "width 40, 5x5 kernels", {}),
-    ("cascaded_v3_small", "widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
-    ("cascaded_v3_tiny", "width 16, 3x3 kernels", {"width": 16, "kernel_size": 3, "feature_width": 12}),
-    (
-        "cascaded_v3_micro",
-        "width 16, 3x3 kernels, half the resolution",
-        {"width": 16, "kernel_size": 3, "half": True, "feature_width": 8},
-    ),
+register_family(
+    _cascade,
+    "P+K for noisy features, with a short history",
+    {
+        "cascaded_v3": ("width 40, 5x5 kernels", {}),
+        "cascaded_v3_small": ("widths 16 and 32, 5x5 kernels", {"width": 16, "kernel_width": 32}),
+        "cascaded_v3_tiny": ("width 16, 3x3 kernels", {"width": 16, "kernel_size": 3, "feature_width": 12}),
+        "cascaded_v3_micro": (
+            "width 16, 3x3 kernels, half the resolution",
+            {"width": 16, "kernel_size": 3, "half": True, "feature_width": 8},
+        ),
+    },
+    kind="kernel",
+    paper="after DOI 10.1007/s00371-023-02951-6",
 )
-for _name, _about, _settings in _PRESETS:
-    register_model(
-        _name,
-        f"P+K for noisy features, with a short history: {_about}",
-        kind="kernel",
-        paper="after DOI 10.1007/s00371-023-02951-6",
-        **_settings,
-    )(_cascade)

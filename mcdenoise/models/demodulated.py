@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -48,9 +49,7 @@ class Demodulated(Wrapper):
         del frame
         output, state = run(self.inner, handed, state)
         # A network that ends with a convolution returns half precision under autocast.
-        stages = {name: _with(albedo, image) for name, image in output.stages.items() if wanted}
-        layers = {name: _with(albedo, layer) for name, layer in output.layers.items()}
-        return output._replace(image=_with(albedo, output.image), stages=stages, layers=layers).noted(note), state
+        return output.lit(partial(_with, albedo), stages=wanted).noted(note), state
 
 
 def _without_albedo(frame: Frame) -> Frame:

@@ -33,9 +33,7 @@ class Exposed(Wrapper):
             frame = prepared(self, frame)
         exposure = frame.statistics["exposure"]
         output, state = self.inner(scaled(frame, exposure), state)
-        stages = {name: image / exposure for name, image in output.stages.items() if frame.hints.stages}
-        layers = {name: layer / exposure for name, layer in output.layers.items()}
-        return output._replace(image=output.image / exposure, stages=stages, layers=layers), state
+        return output.lit(lambda image: image / exposure, stages=frame.hints.stages), state
 
 
 def scaled(frame: Frame, factor: Tensor) -> Frame:

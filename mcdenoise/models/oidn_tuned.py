@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +23,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models._registry import register_model
+from mcdenoise.models._registry import register_family
 from mcdenoise.models.clamped import Clamped
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.restored import Restored
@@ -135,13 +134,6 @@ def _with_buffers(module: nn.Module) -> nn.Module:
     return module
 
 
-_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("oidn_tuned", "the network of quality balanced", {}),
-    ("oidn_tuned_small", "the network of quality fast", {"size": "small"}),
-    ("oidn_tuned_exact", "the network of quality balanced, for features without noise", {}),
-)
-
-
 def _tuned(size: Size = "base", *, fraction: float | None = None, clamp: bool = True, restore: bool = True) -> Model:
     """The network with its memory.
 
@@ -159,11 +151,14 @@ def _tuned(size: Size = "base", *, fraction: float | None = None, clamp: bool = 
     return Restored(model) if restore else model
 
 
-for _name, _about, _settings in _PRESETS:
-    register_model(
-        _name,
-        f"Open Image Denoise's network with a memory, trained further: {_about}",
-        kind="recurrent",
-        paper="after Intel Open Image Denoise 2.5",
-        **_settings,
-    )(_tuned)
+register_family(
+    _tuned,
+    "Open Image Denoise's network with a memory, trained further",
+    {
+        "oidn_tuned": ("the network of quality balanced", {}),
+        "oidn_tuned_small": ("the network of quality fast", {"size": "small"}),
+        "oidn_tuned_exact": ("the network of quality balanced, for features without noise", {}),
+    },
+    kind="recurrent",
+    paper="after Intel Open Image Denoise 2.5",
+)

@@ -133,7 +133,4 @@ class Refined(Wrapper):
         features = {name: image for name, image in features.items() if name in frame.buffers}
         changed = frame.replace(color=color, current=current, **features, layers=layers, skip=skip, statistics={})
         output, state = self.inner(prepared(self.inner, changed), state)
-        stages = {name: image * out for name, image in output.stages.items()}
-        layers = {name: layer * out for name, layer in output.layers.items()}
-        output = output._replace(image=output.image * out, stages=stages, layers=layers)
-        return output.noted(Note("refine", "features and history")), state
+        return output.lit(lambda image: image * out).noted(Note("refine", "features and history")), state

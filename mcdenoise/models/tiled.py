@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,8 +23,6 @@ _WORTHWHILE = 0.9
 # border the corners of a constant image are off by 60 % (oidn_tuned), and pixels at the edge have 1.3 times the error.
 # Twice the width gains nothing more.
 MIRRORED = 16
-# Prefixes of results other than the image and its stages, whose names have no colon.
-_LAYER, _ALPHA = "layer:", "alpha:"
 
 
 class Tiled(Wrapper):
@@ -65,27 +62,19 @@ class Tiled(Wrapper):
             output, state = self._within(Region(0, 0, *frame.size), frame.replace(skip=None), state)
             return output.noted(Note("network", "on 100% of the pixels")), state
         frame = frame if frame.statistics else prepared(self.inner, frame)
-        results: dict[str, Tensor] = {}
-        notes: Sequence[Note] = ()
+        whole: Output | None = None
         halo = self.halo or 0
         for part in parts:
             around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
             output, after = self._within(around, frame)
             if after is not None:
                 raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
-            notes = output.notes
-            layers = {_LAYER + name: layer for name, layer in output.layers.items()}
-            alpha = {} if output.alpha is None else {_ALPHA: output.alpha}
-            for name, image in {"image": output.image, **output.stages, **layers, **alpha}.items():
-                if name not in results:
-                    results[name] = _known(frame, name).to(image.dtype, copy=True)
-                kept.of(results[name]).copy_(kept.within(around).of(image))
+            whole = _known(frame, output) if whole is None else whole._replace(notes=output.notes)
+            for result, image in zip(_images(whole), _images(output), strict=True):
+                kept.of(result).copy_(kept.within(around).of(image))
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note = Note("network", f"on {computed:.0%} of the pixels", 1 - computed)
-        image = results.pop("image") if results else _known(frame, "image")
-        covered = results.pop(_ALPHA) if _ALPHA in results else None
-        layers = {name: results.pop(_LAYER + name) for name in frame.layers if _LAYER + name in results}
-        return Output(image, results, layers, covered, notes).noted(note), None
+        return (_known(frame, Output(frame.color)) if whole is None else whole).noted(note), None
 
     def _within(self, around: Region, frame: Frame, state: State = None) -> tuple[Output, State]:
         """The method on a rectangle of the frame, with a mirror image on those sides where the frame ends."""
@@ -132,14 +121,25 @@ def without_border(image: Tensor, width: int = MIRRORED) -> Tensor:
     return image.narrow(-2, width, height).narrow(-1, width, columns).contiguous()
 
 
-def _known(frame: Frame, stage: str) -> Tensor:
-    """The values of pixels that are not computed: the known result, or the input."""
-    if stage.startswith(_LAYER):
-        return frame.layers[stage.removeprefix(_LAYER)]
-    if stage == _ALPHA and frame.alpha is not None:
-        return frame.alpha
-    known = None if frame.skip is None else frame.skip.of(stage)
-    return frame.color if known is None else known
+def _known(frame: Frame, output: Output) -> Output:
+    """Images of the whole frame for an output of a tile: the values of pixels that are not computed.
+
+    They are the known result, or the input.
+    """
+
+    def known(stage: str, like: Tensor) -> Tensor:
+        found = None if frame.skip is None else frame.skip.of(stage)
+        return (frame.color if found is None else found).to(like.dtype, copy=True)
+
+    stages = {name: known(name, image) for name, image in output.stages.items()}
+    layers = {name: frame.layers[name].to(layer.dtype, copy=True) for name, layer in output.layers.items()}
+    alpha = None if output.alpha is None or frame.alpha is None else frame.alpha.to(output.alpha.dtype, copy=True)
+    return Output(known("image", output.image), stages, layers, alpha, output.notes)
+
+
+def _images(output: Output) -> list[Tensor]:
+    alpha = [] if output.alpha is None else [output.alpha]
+    return [output.image, *output.stages.values(), *output.layers.values(), *alpha]
 
 
 class Region(NamedTuple):

@@ -11,7 +11,7 @@ filter, the library's result of the accumulated radiance has up to 1.5 times the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -21,7 +21,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models._registry import register_model
+from mcdenoise.models._registry import register_family
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT, Recurrent
@@ -132,15 +132,10 @@ def _wild(size: Size = "small", stem: int = 1, *, history: History = "accumulate
     return Demodulated(model if history == "previous" else Accumulated(model, alpha_min=alpha_min))
 
 
-_PRESETS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("wild", "at full resolution", {}),
-    ("wild_small", "at half resolution", {"stem": 2}),
+register_family(
+    _wild,
+    "one network for sequences and stills, that sees the accumulated radiance",
+    {"wild": ("at full resolution", {}), "wild_small": ("at half resolution", {"stem": 2})},
+    kind="recurrent",
+    paper="after Intel Open Image Denoise 2.5",
 )
-for _name, _about, _settings in _PRESETS:
-    register_model(
-        _name,
-        f"one network for sequences and stills, that sees the accumulated radiance: {_about}",
-        kind="recurrent",
-        paper="after Intel Open Image Denoise 2.5",
-        **_settings,
-    )(_wild)
