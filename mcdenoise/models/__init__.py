@@ -1,6 +1,7 @@
 """The zoo: denoisers assembled from the operators, by name, and wrappers that any method can use."""
 
 from mcdenoise.models._adapter import FromBuffers, as_model
+from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._layers import answered, carried, with_carried
 from mcdenoise.models._overview import ModelOverview, overview, users_of
@@ -11,7 +12,7 @@ from mcdenoise.models._precision import (
     fastest_precision,
     has_network,
 )
-from mcdenoise.models._registry import build_model, find_model, list_models, register_model, troubles
+from mcdenoise.models._registry import build_model, find_model, list_models, troubles
 from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._report import FrameReport, Stage, summarize
 from mcdenoise.models._weights import (

@@ -14,7 +14,8 @@ from torch import nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._defaults import without_draws
-from mcdenoise.models._registry import Kind, build_model, find_model, list_models
+from mcdenoise.models._entries import Kind
+from mcdenoise.models._registry import build_model, find_model, list_models
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.own import refused
 

@@ -1,134 +1,35 @@
-"""The register of the zoo: it maps names to constructors, and finds models that are not registered."""
+"""Finding and making models by name: those of the register, of installed packages, and a user's own."""
 
 from __future__ import annotations
 
 import functools
 import importlib
-import importlib.util
 import inspect
 import pkgutil
 import re
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import Distribution, EntryPoint, distributions
 from types import BuiltinFunctionType
-from typing import Any, Literal, get_args
+from typing import Any
 
 from torch import nn
 
 from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import outlined, plain_defaults
+from mcdenoise.models._entries import MODELS, Entry
 from mcdenoise.models._interface import Model
 from mcdenoise.own import in_one_line, load_own, refused
 
 GROUP = "mcdenoise.models"
 _FACTORY = "expected a factory, a function without required arguments that returns a model"
 
-# How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
-# network; a filter without weights; another denoiser; or unspecified.
-Kind = Literal["kernel", "pixel", "grid", "recurrent", "filter", "peer", "other"]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A registered model.
-
-    Args:
-        construct: makes the model, with fresh weights.
-        settings: arguments for ``construct`` under this name.
-        description: one line.
-        kind: how the model makes its image.
-        paper: authors and year; empty if there is none.
-        requires: the optional package that the model needs; empty if there is none.
-    """
-
-    construct: Callable[..., Any]
-    settings: dict[str, Any]
-    description: str
-    kind: Kind = "other"
-    paper: str = ""
-    requires: str = ""
-
-    @property
-    def installed(self) -> bool:
-        """Whether the required package is installed."""
-        return not self.requires or importlib.util.find_spec(self.requires) is not None
-
-    @property
-    def of_zoo(self) -> bool:
-        """Whether it is a model of this package."""
-        return str(getattr(self.construct, "__module__", "")).startswith("mcdenoise.models.")
-
-    @property
-    def architecture(self) -> dict[str, Any]:
-        """The settings that determine the weights, with their defaults: the constructor's positional arguments."""
-        parameters = inspect.signature(self.construct).parameters.values()
-        own = {each.name: each.default for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD}
-        return own | {name: value for name, value in self.settings.items() if name in own}
-
-
-_MODELS: dict[str, Entry] = {}
-
-
-def register_model(
-    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", requires: str = "", **settings: Any
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator that registers a model's constructor under ``name``.
-
-    The constructor's positional arguments determine the weights (sizes); its keyword-only arguments do not (history,
-    skipping).
-
-    Args:
-        name: the registered name.
-        description: one line; by default the first line of the constructor's docstring.
-        kind: how the model makes its image.
-        paper: authors and year, such as "Schied et al. 2017".
-        requires: the optional package that the model needs.
-        settings: arguments for the constructor under this name.
-
-    Raises:
-        ValueError: the name is taken, or the kind is unknown.
-    """
-    if kind not in get_args(Kind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, found '{kind}'")
-
-    def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
-        if name in _MODELS:
-            raise ValueError(f"model '{name}' is registered twice")
-        about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
-        _MODELS[name] = Entry(constructor, settings, about, kind, paper, requires)
-        return constructor
-
-    return enter
-
-
-def register_family(
-    constructor: Callable[..., Any],
-    description: str,
-    presets: Mapping[str, tuple[str, dict[str, Any]]],
-    *,
-    kind: Kind,
-    paper: str,
-) -> None:
-    """Register a constructor under several names.
-
-    Args:
-        constructor: of all of them.
-        description: what they have in common.
-        presets: for each name what it is beside that, and its settings.
-        kind: see :func:`register_model`.
-        paper: see :func:`register_model`.
-    """
-    for name, (about, settings) in presets.items():
-        register_model(name, f"{description}: {about}", kind=kind, paper=paper, **settings)(constructor)
-
 
 def list_models(pattern: str = "*") -> list[str]:
     """Sorted names of all registered models that match a shell-style pattern, including those of installed packages."""
     _import_pages()
-    return sorted(name for name in {*_MODELS, *_offered().points} if fnmatch(name, pattern))
+    return sorted(name for name in {*MODELS, *_offered().points} if fnmatch(name, pattern))
 
 
 def troubles() -> list[str]:
@@ -137,7 +38,7 @@ def troubles() -> list[str]:
     taken = [
         f"{_named(point.dist)}: expected a name for its model that is not taken, found '{name}', which is not used"
         for name, point in _offered().points.items()
-        if name in _MODELS and _MODELS[name].of_zoo
+        if name in MODELS and MODELS[name].of_zoo
     ]
     return taken + _offered().troubles
 
@@ -145,7 +46,7 @@ def troubles() -> list[str]:
 def is_registered(name: str) -> bool:
     """Whether a name is that of a registered model, without importing code that a name could point to."""
     _import_pages()
-    return name in _MODELS or name in _offered().points
+    return name in MODELS or name in _offered().points
 
 
 def find_model(name: str) -> Entry:
@@ -159,8 +60,8 @@ def find_model(name: str) -> Entry:
         InputError: there is no such model, file, module or factory.
     """
     _import_pages()
-    if name in _MODELS:
-        return _MODELS[name]
+    if name in MODELS:
+        return MODELS[name]
     if name in (points := _offered().points):
         with refused(f"model '{name}': the package {_named(points[name].dist)} offers it and cannot load it"):
             return _of_factory(name, points[name].load())

@@ -36,11 +36,11 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
+from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network
-from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.nn.inputs import features_of
 from mcdenoise.nn.samples import describe_samples, samples_of

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, carried
-from mcdenoise.models._registry import register_family
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.coarse_to_fine import CoarseToFine

@@ -8,8 +8,8 @@ unless the light is diffuse and very noisy.
 
 from __future__ import annotations
 
+from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model
-from mcdenoise.models._registry import register_family
 from mcdenoise.models.cascaded_v2 import both_networks, with_history
 from mcdenoise.models.refined import Refined
 from mcdenoise.models.skipping import TOLERANCE

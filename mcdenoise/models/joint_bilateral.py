@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._registry import register_model
 from mcdenoise.models._void import ISLAND
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated

@@ -21,9 +21,9 @@ from torch.func import functional_call
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models._registry import register_family
 from mcdenoise.models.clamped import Clamped
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.restored import Restored

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
+from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import reset_of
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._motion import motion_unless_still, surface_before
 from mcdenoise.models._published import demodulated
-from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
 

@@ -19,9 +19,9 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
+from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models._registry import register_family
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT, Recurrent

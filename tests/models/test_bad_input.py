@@ -280,7 +280,7 @@ def test_a_network_without_weights_says_which_have_them() -> None:
         message = refused(lambda: Denoiser("unweighted"))
         assert "'unweighted': expected shipped weights, found them only for: " in message
     finally:
-        _registry._MODELS.pop("unweighted")
+        _registry.MODELS.pop("unweighted")
 
 
 def test_states_are_of_tensors_that_these_tests_look_at() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from mcdenoise.cli.models import models
 from mcdenoise.models import _registry, list_models, overview, register_model
-from mcdenoise.models._registry import Kind
+from mcdenoise.models._entries import Kind
 from mcdenoise.models.oidn_open import archive_of_library
 
 

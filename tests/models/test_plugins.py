@@ -55,7 +55,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     _registry._offered.cache_clear()
     yield tmp_path
     for name in [*BROKEN, "vague"]:
-        _registry._MODELS.pop(name, None)
+        _registry.MODELS.pop(name, None)
     _registry._offered.cache_clear()
 
 

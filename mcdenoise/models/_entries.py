@@ -1,0 +1,107 @@
+"""The entries of the register of the zoo: each method's page makes its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+# How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
+# network; a filter without weights; another denoiser; or unspecified.
+Kind = Literal["kernel", "pixel", "grid", "recurrent", "filter", "peer", "other"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered model.
+
+    Args:
+        construct: makes the model, with fresh weights.
+        settings: arguments for ``construct`` under this name.
+        description: one line.
+        kind: how the model makes its image.
+        paper: authors and year; empty if there is none.
+        requires: the optional package that the model needs; empty if there is none.
+    """
+
+    construct: Callable[..., Any]
+    settings: dict[str, Any]
+    description: str
+    kind: Kind = "other"
+    paper: str = ""
+    requires: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether the required package is installed."""
+        return not self.requires or importlib.util.find_spec(self.requires) is not None
+
+    @property
+    def of_zoo(self) -> bool:
+        """Whether it is a model of this package."""
+        return str(getattr(self.construct, "__module__", "")).startswith("mcdenoise.models.")
+
+    @property
+    def architecture(self) -> dict[str, Any]:
+        """The settings that determine the weights, with their defaults: the constructor's positional arguments."""
+        parameters = inspect.signature(self.construct).parameters.values()
+        own = {each.name: each.default for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD}
+        return own | {name: value for name, value in self.settings.items() if name in own}
+
+
+MODELS: dict[str, Entry] = {}
+
+
+def register_model(
+    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", requires: str = "", **settings: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator that registers a model's constructor under ``name``.
+
+    The constructor's positional arguments determine the weights (sizes); its keyword-only arguments do not (history,
+    skipping).
+
+    Args:
+        name: the registered name.
+        description: one line; by default the first line of the constructor's docstring.
+        kind: how the model makes its image.
+        paper: authors and year, such as "Schied et al. 2017".
+        requires: the optional package that the model needs.
+        settings: arguments for the constructor under this name.
+
+    Raises:
+        ValueError: the name is taken, or the kind is unknown.
+    """
+    if kind not in get_args(Kind):
+        raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, found '{kind}'")
+
+    def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
+        if name in MODELS:
+            raise ValueError(f"model '{name}' is registered twice")
+        about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
+        MODELS[name] = Entry(constructor, settings, about, kind, paper, requires)
+        return constructor
+
+    return enter
+
+
+def register_family(
+    constructor: Callable[..., Any],
+    description: str,
+    presets: Mapping[str, tuple[str, dict[str, Any]]],
+    *,
+    kind: Kind,
+    paper: str,
+) -> None:
+    """Register a constructor under several names.
+
+    Args:
+        constructor: of all of them.
+        description: what they have in common.
+        presets: for each name what it is beside that, and its settings.
+        kind: see :func:`register_model`.
+        paper: see :func:`register_model`.
+    """
+    for name, (about, settings) in presets.items():
+        register_model(name, f"{description}: {about}", kind=kind, paper=paper, **settings)(constructor)
