@@ -22,7 +22,7 @@ from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import reset_of
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._motion import motion_unless_still, surface_before
+from mcdenoise.models._motion import motion_to_previous, surface_before
 from mcdenoise.models._published import demodulated
 from mcdenoise.models._state import own_state
 from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
@@ -76,7 +76,7 @@ class Svgf(nn.Module):
         history = own_state(state, History, frame, channels=entering.shape[1])
         normal, depth = frame.normal, frame.depth
         reset = reset_of(frame, history and history.length, history and history.view_projection)
-        motion = None if history is None or reset else motion_unless_still(frame, history.view_projection)
+        motion = None if history is None or reset else motion_to_previous(frame, history.view_projection)
         light, moments, length = self._accumulate(frame, entering, None if reset else history, motion)
         variance = variance_of(moments, length, frame)
         filtered, kept = light, light
