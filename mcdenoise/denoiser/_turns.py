@@ -12,7 +12,8 @@ from weakref import WeakKeyDictionary
 import torch
 
 _Arguments = ParamSpec("_Arguments")
-_Result, _Owner = TypeVar("_Result"), TypeVar("_Owner")
+_Result = TypeVar("_Result")
+_Owner = TypeVar("_Owner")
 # The locks are not in the denoisers, which can be copied to another process.
 _locks: WeakKeyDictionary[object, threading.RLock] = WeakKeyDictionary()
 # The process, if it has denoised frames, and so may have started threads of torch.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import torch
 from torch import Tensor
@@ -81,34 +81,25 @@ def own_parts(state: State, names: tuple[str, ...]) -> dict[str, State]:
 
 def _check_tensors(state: State, keeper: str, frame: Frame, channels: int | None) -> None:
     color = frame.color
+
+    def refuse(expected: str, found: str) -> NoReturn:
+        raise InputError(f"state: expected what {keeper} keeps {expected}, found {found}; {ADVICE}")
+
     tensors = [leaf for leaf in pytree.tree_leaves(state) if leaf is not None]
+    if not tensors:
+        refuse("of a frame", "it without a tensor")
     for leaf in tensors:
         if not isinstance(leaf, Tensor):
-            raise InputError(f"state: expected tensors in what {keeper} keeps, found {type(leaf).__name__}; {ADVICE}")
+            refuse("in tensors", type(leaf).__name__)
         if leaf.device != color.device:
-            raise InputError(
-                f"state: expected what {keeper} keeps on {color.device} like 'color', found it on {leaf.device}; "
-                "move one to the other"
-            )
+            refuse(f"on {color.device} like 'color'", f"it on {leaf.device}")
         if leaf.shape[:1] != color.shape[:1]:
-            found = len(leaf) if leaf.dim() else "none"
-            raise InputError(
-                f"state: expected what {keeper} keeps of a batch of {len(color)} like 'color', found it of {found}; "
-                "reset the denoiser, or begin with None"
-            )
-    if not tensors:
-        raise InputError(f"state: expected what {keeper} keeps of a frame, found it without a tensor; {ADVICE}")
+            refuse(f"of a batch of {len(color)} like 'color'", f"it of {len(leaf) if leaf.dim() else 'none'}")
     first = tensors[0]
     if (first.dtype == torch.float64) != (color.dtype == torch.float64):
-        raise InputError(
-            f"state: expected what {keeper} keeps of frames of {color.dtype}, found it of frames of {first.dtype}; "
-            "convert one to the other"
-        )
+        refuse(f"of frames of {color.dtype}", f"it of frames of {first.dtype}")
     if channels is not None and first.shape[1] != channels:
-        raise InputError(
-            f"state: expected what {keeper} keeps in {channels} channels, found {first.shape[1]}: of another method, "
-            f"other settings or other layers; {ADVICE}"
-        )
+        refuse(f"in {channels} channels", f"{first.shape[1]}: of another method, other settings or other layers")
 
 
 def _file_of(kind: type) -> str:
