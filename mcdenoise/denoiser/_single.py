@@ -77,7 +77,11 @@ def denoise(
     image: NDArray[np.float32] = denoiser(frame)[0].cpu().numpy()
     # Raises an error for invalid values, which a GPU reports late.
     denoiser._settle()
-    shape = np.shape(color)
+    return _like(image, np.shape(color), layout)
+
+
+def _like(image: NDArray[np.float32], shape: tuple[int, ...], layout: Layout) -> NDArray[np.float32]:
+    """An image ``(3, H, W)`` in the shape and layout of the noisy one."""
     if len(shape) == 2 or shape[-1 if layout == "HWC" else 0] == 1:
         return np.ascontiguousarray(image.mean(0).reshape(shape))
     return np.ascontiguousarray(image if layout == "CHW" else image.transpose(1, 2, 0))

@@ -6,14 +6,13 @@ import functools
 import os
 import threading
 from collections.abc import Callable
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
 
 import torch
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
-_Owner = TypeVar("_Owner")
 # The locks are not in the denoisers, which can be copied to another process.
 _locks: WeakKeyDictionary[object, threading.RLock] = WeakKeyDictionary()
 # The process, if it has denoised frames, and so may have started threads of torch.
@@ -21,12 +20,12 @@ started: set[int] = set()
 
 
 def in_turn(
-    method: Callable[Concatenate[_Owner, _Arguments], _Result],
-) -> Callable[Concatenate[_Owner, _Arguments], _Result]:
+    method: Callable[Concatenate[Any, _Arguments], _Result],
+) -> Callable[Concatenate[Any, _Arguments], _Result]:
     """Run a denoiser's methods in one thread at a time."""
 
     @functools.wraps(method)
-    def alone(denoiser: _Owner, /, *arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
+    def alone(denoiser: Any, /, *arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
         with _locks.setdefault(denoiser, threading.RLock()):
             return method(denoiser, *arguments, **settings)
 

@@ -36,8 +36,8 @@ class Watch(NamedTuple):
             noise: whether to look for repeated noise.
         """
         pixels = thinned(frame) if noise else None
-        both = pixels is not None and self.pixels is not None
-        repeats = both and noise_is_repeated(frame, pixels, self.pixels)
+        last = self.pixels
+        repeats = pixels is not None and last is not None and noise_is_repeated(frame, pixels, last)
         doubt = doubt_motion(frame, self.compared) if motion and self.left else ""
         compared = seen_in(frame) if motion and self.left and not doubt else None
         return Watch(pixels, compared, 0 if doubt else max(self.left - 1, 0)), repeats, doubt

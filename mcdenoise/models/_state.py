@@ -104,7 +104,7 @@ def _check_tensors(state: State, keeper: str, frame: Frame, channels: int | None
 
 def _file_of(kind: type) -> str:
     """The file of the method, such as "svgf"."""
-    return kind.__module__.rpartition(".")[2]
+    return kind.__module__.rpartition(".")[2].lstrip("_")
 
 
 def _described(state: State) -> str:

@@ -132,16 +132,18 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
         tensors = {key: file.get_tensor(key) for key in keys}
     if description.get("sha256") != _digest(tensors):
         raise InputError(f"{path}: expected tensors that match the header's sha256, found others; the file is damaged")
-    weights = _named(model)
-    for key in shapes:
-        tensor = tensors[key]
+    _copy(path, {key: tensors[key] for key in shapes}, _named(model))
+    return model.eval() if isinstance(model, nn.Module) else model
+
+
+def _copy(path: Path, tensors: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> None:
+    for key, tensor in tensors.items():
         if weights[key].is_floating_point() and not tensor.is_floating_point():
             raise InputError(f"{path}: layer '{key}': expected floating-point weights, found {tensor.dtype}")
         if not tensor.isfinite().all():
             raise InputError(f"{path}: layer '{key}': expected finite weights, found NaN or infinite ones")
         with torch.no_grad():
             weights[key].copy_(tensor)
-    return model.eval() if isinstance(model, nn.Module) else model
 
 
 def model_of(path: Path) -> str:

@@ -30,7 +30,7 @@ Layers and alpha are fitted, accumulated and clamped at 0 together with the colo
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -96,7 +96,7 @@ class Bmfr(nn.Module):
         if not 0 < second_alpha <= 1:
             raise InputError(f"second_alpha: expected in (0, 1], found {second_alpha}")
         self.second_alpha, self.persistence = second_alpha, 1 - second_alpha
-        self.limits = {"position_limit": position_limit, "normal_limit": normal_limit}
+        self.limits: dict[str, Any] = {"position_limit": position_limit, "normal_limit": normal_limit}
         self.register_buffer("_starts", torch.tensor(STARTS), persistent=False)
         buffers = frozenset({"color", "normal", "position", "length"})
         self.needs = Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
