@@ -199,10 +199,15 @@ class Accumulated(Wrapper):
         if not specular_length >= 0:
             raise InputError(f"specular_length: expected at least 0, found {specular_length}")
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
-        self.persistence = 1 - alpha_min
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
         self.also = tuple(also)
+
+    # An attribute would be a setting for the training, which makes the wrappers at a model's outside anew.
+    @property
+    def persistence(self) -> float:
+        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
+        return 1 - self.alpha_min
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """None: those of the method inside are of the accumulated radiance."""
