@@ -94,7 +94,8 @@ def _check_tensors(state: State, keeper: str, frame: Frame, channels: int | None
         if leaf.device != color.device:
             refuse(f"on {color.device} like 'color'", f"it on {leaf.device}")
         if leaf.shape[:1] != color.shape[:1]:
-            refuse(f"of a batch of {len(color)} like 'color'", f"it of {len(leaf) if leaf.dim() else 'none'}")
+            count = len(leaf) if leaf.dim() else "none"
+            refuse(f"of a batch of {len(color)} like 'color'", f"it of {count} (reset the denoiser)")
     first = tensors[0]
     if (first.dtype == torch.float64) != (color.dtype == torch.float64):
         refuse(f"of frames of {color.dtype}", f"it of frames of {first.dtype}")
