@@ -154,7 +154,7 @@ def test_derivatives_of_a_denoiser_in_black_pixels(tmp_path: Path) -> None:
         checks = [each for each in check_denoiser(f"{path}:{name}", (torch.float32,)) if each.what == "gradient"]
         found[name] = {each.case for each in checks if not each.passed}
         assert len(checks) > len(found[name])
-    assert found == {"root": {"uneven radiance", "radiance 0"}, "safe": set()}
+    assert found == {"root": {"uneven radiance", "color 0"}, "safe": set()}
 
 
 OWN = """

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import cycle
 from typing import Any
 
 import torch
@@ -86,7 +87,8 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
     model = _without_history(whole)
     if not isinstance(model, nn.Module) or not whole.needs.trainable or model(CASES[0].frame())[1] is not None:
         return
-    exact = _Exact(copy.deepcopy(model).double())
+    with torch.no_grad():
+        exact = _Exact(copy.deepcopy(model).double(), CASES)
     for dtype in dtypes:
         for case in CASES:
             yield from _check_case(name, model, exact, case, dtype)
@@ -146,54 +148,56 @@ def _check_exposure(name: str, model: nn.Module, exact: _Exact, case: ModelCase,
 def _compared(name: str, exact: _Exact, case: ModelCase, dtype: torch.dtype, what: str, found: Tensor) -> Check:
     unit = torch.finfo(dtype).eps / 2
     # Everything except convolutions is in float32.
-    response = ROUNDED * max(exact.products(case, unit), torch.finfo(torch.float32).eps) + exact.sums(case)
-    error, allowed = relative_change(found, exact.image(case)) / (2 * unit), ALLOWED * response / (2 * unit)
+    response = ROUNDED * max(exact.products(unit)[case.name], torch.finfo(torch.float32).eps) + exact.sums[case.name]
+    error, allowed = relative_change(found, exact.images[case.name]) / (2 * unit), ALLOWED * response / (2 * unit)
     message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
     return Check(name, case.name, name_of(dtype), "", what, error, allowed, response / unit, not message, message)
 
 
 class _Exact:
-    """A model in float64: its images, and how much they change when the model rounds; each is computed once.
+    """A model in float64: its images, and how much they change when the model rounds.
+
+    Cases of equal size run as one batch.
 
     Args:
         model: in float64.
+        cases: of the images.
     """
 
-    def __init__(self, model: nn.Module) -> None:
+    def __init__(self, model: nn.Module, cases: Sequence[ModelCase]) -> None:
         self.model = model
         self._squared = {
             each: _with_squared_weights(each)
             for each in model.modules()
             if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)
         }
-        self._known: dict[tuple[str, float], Any] = {}
+        alike: dict[tuple[int, int], list[ModelCase]] = {}
+        for case in cases:
+            alike.setdefault(case.size, []).append(case)
+        self._batches = [([case.name for case in group], _batch(group)) for group in alike.values()]
+        self.images = {
+            name: image
+            for names, frame in self._batches
+            for name, image in zip(names, _image(model, frame).split(1), strict=True)
+        }
+        # The largest changes of the images when convolutions are summed in float32.
+        self.sums = self._largest([self._summed])
+        self._products: dict[float, dict[str, float]] = {}
 
-    def _once(self, case: ModelCase, unit: float, compute: Callable[[Frame], Any]) -> Any:
-        key = case.name, unit
-        if key not in self._known:
-            self._known[key] = compute(case.frame().to(torch.float64))
-        return self._known[key]
+    def products(self, unit: float) -> dict[str, float]:
+        """The largest changes of the images when every weight and buffer changes by ``unit`` relatively."""
+        if unit not in self._products:
+            self._products[unit] = self._largest([partial(self._moved, unit=unit, seed=i) for i in range(_DRAWS)])
+        return self._products[unit]
 
-    def image(self, case: ModelCase) -> Tensor:
-        """The image of a case."""
-        image: Tensor = self._once(case, 0.0, partial(_image, self.model))
-        return image
-
-    def products(self, case: ModelCase, unit: float) -> float:
-        """The largest change of the image when every weight and buffer changes by ``unit`` relatively, up or down."""
-
-        def change(frame: Frame) -> float:
-            return max(relative_change(self._moved(frame, unit, seed), self.image(case)) for seed in range(_DRAWS))
-
-        return float(self._once(case, unit, change))
-
-    def sums(self, case: ModelCase) -> float:
-        """The largest change of the image when convolutions are summed in float32."""
-
-        def change(frame: Frame) -> float:
-            return max(relative_change(self._summed(frame, seed), self.image(case)) for seed in range(_DRAWS))
-
-        return float(self._once(case, -1.0, change))
+    def _largest(self, changes: Sequence[Callable[[Frame], Tensor]]) -> dict[str, float]:
+        """The largest change of each case's image; each function may return several copies of the batch."""
+        found = dict.fromkeys(self.images, 0.0)
+        for names, frame in self._batches:
+            for change in changes:
+                for name, image in zip(cycle(names), change(frame).split(1), strict=False):
+                    found[name] = max(found[name], relative_change(image, self.images[name]))
+        return found
 
     def _moved(self, frame: Frame, unit: float, seed: int) -> Tensor:
         generator = torch.Generator().manual_seed(seed)
@@ -207,15 +211,15 @@ class _Exact:
         image: Tensor = output.image
         return image
 
-    def _summed(self, frame: Frame, seed: int) -> Tensor:
-        """The image when the result of every convolution changes by the rounding error of a float32 sum of n products.
+    def _summed(self, frame: Frame) -> Tensor:
+        """Images when the result of every convolution changes by the rounding error of a float32 sum of n products.
 
         The k-th partial sum of products with random signs has the size of sqrt(k) products, and a relative rounding
         error of ``u``. The rounding errors of all partial sums add up to ``u n / sqrt(2)`` of a product, which is
         ``u sqrt(n / 2)`` times the root of the sum of squared products (Higham, Accuracy and Stability of Numerical
-        Algorithms, 2002, Sec. 2.8 and 4.2).
+        Algorithms, 2002, Sec. 2.8 and 4.2). Every image has several copies, with signs of their own.
         """
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(0)
         unit = torch.finfo(torch.float32).eps / 2
 
         def change(layer: nn.Module, given: tuple[Any, ...], result: Tensor) -> Tensor:
@@ -230,10 +234,16 @@ class _Exact:
 
         handles = [layer.register_forward_hook(change) for layer in self._squared]
         try:
-            return _image(self.model, frame)
+            return _image(self.model, frame.map(lambda image: image.repeat(_DRAWS, 1, 1, 1)))
         finally:
             for handle in handles:
                 handle.remove()
+
+
+def _batch(cases: Sequence[ModelCase]) -> Frame:
+    """The frames of cases of equal size, in float64."""
+    frames = [dict(case.frame().to(torch.float64).items()) for case in cases]
+    return Frame(**{name: torch.cat([frame[name] for frame in frames]) for name in frames[0]})
 
 
 def _with_squared_weights(layer: nn.Module) -> nn.Module:
