@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
-from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, ROUNDED, relative_change
+from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, ROUNDED, joined, relative_change
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -162,11 +162,6 @@ def _batches(shots: Shots) -> Iterable[Shots]:
     return alike.values()
 
 
-def _joined(frames: Sequence[Frame]) -> Frame:
-    """Frames as one batch."""
-    return Frame(**{name: torch.cat([dict(frame.items())[name] for frame in frames]) for name in frames[0].buffers})
-
-
 def _valid(denoiser: Denoiser, shots: Shots, dtype: torch.dtype) -> Iterator[Check]:
     """Every image is finite and non-negative."""
     denoiser.reset()
@@ -174,7 +169,7 @@ def _valid(denoiser: Denoiser, shots: Shots, dtype: torch.dtype) -> Iterator[Che
     for number, frames in enumerate(zip(*shots.values(), strict=True)):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            images = denoiser(_joined(frames))
+            images = denoiser(joined(frames))
         for name, image in zip(shots, images, strict=True):
             if not torch.isfinite(image).all() or not (image >= 0).all():
                 messages[name] = messages[name] or f"frame {number}: NaN, infinite or negative pixels"
@@ -190,7 +185,7 @@ def _gradients(model: str, shots: Shots) -> Iterator[Check]:
         leaves: list[Tensor] = []
         try:
             for frames in zip(*batch.values(), strict=True):
-                frame = _joined(frames).map(lambda image: image.detach().requires_grad_())
+                frame = joined(frames).map(lambda image: image.detach().requires_grad_())
                 leaves += dict(frame.items()).values()
                 image = denoiser(frame)
         except InputError:
@@ -262,11 +257,12 @@ def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
     images must not see each other.
     """
     eps = torch.finfo(torch.bfloat16 if denoiser.precision == "bfloat16" else torch.float32).eps
-    changes = [lambda frame: frame, *(partial(_moved, eps=eps, seed=seed) for seed in range(_PATTERNS))]
+    changes: list[Callable[[Frame], Frame]] = [lambda frame: frame]
+    changes += [partial(_moved, eps=eps, seed=seed) for seed in range(_PATTERNS)]
     changes += [partial(_scaled, exposure=exposure) for exposure in EXPOSURES]
     frames = [_frame(seed, dtype).to(torch.float32) for seed in range(FRAMES)]
     denoiser.reset()
-    outputs = [denoiser.output(_joined([change(frame) for change in changes])) for frame in frames]
+    outputs = [denoiser.output(joined([change(frame) for change in changes])) for frame in frames]
 
     def error(image: Tensor, index: int, exposure: float = 1.0) -> float:
         return relative_change(image[index : index + 1] / exposure, image[:1]) / eps

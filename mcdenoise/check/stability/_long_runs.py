@@ -15,7 +15,8 @@ from mcdenoise.models import Accumulated, FrameReport, Output, State
 from mcdenoise.ops import accumulate
 from mcdenoise.ops.lag import THRESHOLD
 
-FRAMES, MOVING_FRAMES = 10_000, 1_000
+# More than 2048, the longest history that float16 counts.
+FRAMES, MOVING_FRAMES = 3_000, 1_000
 ALPHA_MIN = 0.1
 _SIZE = (4, 6)
 _WINDOW = 24  # pixels, so that a light that goes out is visible in several windows of the anti-lag rule

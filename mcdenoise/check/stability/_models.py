@@ -20,6 +20,7 @@ from mcdenoise.models import Accumulated, Skipping, parts_of
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 8
+_LEAST_OF_HALF = torch.finfo(torch.float16).eps / 2
 _LEAST_RADIANCE = 1e-30
 # A convolution rounds weights, activations and results; each is a relative change of its products like the measured
 # one.
@@ -88,7 +89,7 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
     if not isinstance(model, nn.Module) or not whole.needs.trainable or model(CASES[0].frame())[1] is not None:
         return
     with torch.no_grad():
-        exact = _Exact(copy.deepcopy(model).double(), CASES)
+        exact = _Exact(model, CASES)
     for dtype in dtypes:
         for case in CASES:
             yield from _check_case(name, model, exact, case, dtype)
@@ -157,43 +158,41 @@ def _compared(name: str, exact: _Exact, case: ModelCase, dtype: torch.dtype, wha
 class _Exact:
     """A model in float64: its images, and how much they change when the model rounds.
 
-    Cases of equal size run as one batch.
-
     Args:
-        model: in float64.
+        model: in float32.
         cases: of the images.
     """
 
     def __init__(self, model: nn.Module, cases: Sequence[ModelCase]) -> None:
-        self.model = model
+        self._short, self.model = model, copy.deepcopy(model).double()
         self._squared = {
             each: _with_squared_weights(each)
-            for each in model.modules()
+            for each in self.model.modules()
             if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)
         }
-        alike: dict[tuple[int, int], list[ModelCase]] = {}
-        for case in cases:
-            alike.setdefault(case.size, []).append(case)
-        self._batches = [([case.name for case in group], _batch(group)) for group in alike.values()]
-        self.images = {
-            name: image
-            for names, frame in self._batches
-            for name, image in zip(names, _image(model, frame).split(1), strict=True)
-        }
+        self._frames = {case.name: case.frame().to(torch.float64) for case in cases}
+        self.images = {name: _image(self.model, frame) for name, frame in self._frames.items()}
         # The largest changes of the images when convolutions are summed in float32.
-        self.sums = self._largest([self._summed])
+        self.sums = self._largest([[name] for name in self.images], [self._summed])
         self._products: dict[float, dict[str, float]] = {}
 
     def products(self, unit: float) -> dict[str, float]:
         """The largest changes of the images when every weight and buffer changes by ``unit`` relatively."""
         if unit not in self._products:
-            self._products[unit] = self._largest([partial(self._moved, unit=unit, seed=i) for i in range(_DRAWS)])
+            moves = [partial(self._moved, unit=unit, seed=seed) for seed in range(_DRAWS)]
+            alike: dict[tuple[int, int], list[str]] = {}
+            for name, frame in self._frames.items():
+                alike.setdefault(frame.size, []).append(name)
+            # In float64 a batch takes as long as its frames one by one, and in float32 a quarter of it.
+            batches = list(alike.values()) if unit >= _LEAST_OF_HALF else [[name] for name in self.images]
+            self._products[unit] = self._largest(batches, moves)
         return self._products[unit]
 
-    def _largest(self, changes: Sequence[Callable[[Frame], Tensor]]) -> dict[str, float]:
+    def _largest(self, batches: list[list[str]], changes: Sequence[Callable[[Frame], Tensor]]) -> dict[str, float]:
         """The largest change of each case's image; each function may return several copies of the batch."""
         found = dict.fromkeys(self.images, 0.0)
-        for names, frame in self._batches:
+        for names in batches:
+            frame = joined([self._frames[name] for name in names])
             for change in changes:
                 for name, image in zip(cycle(names), change(frame).split(1), strict=False):
                     found[name] = max(found[name], relative_change(image, self.images[name]))
@@ -206,8 +205,10 @@ class _Exact:
             signs = torch.randint(0, 2, tensor.shape, generator=generator) * 2 - 1
             return tensor * (1 + unit * signs)
 
-        weights = {name: move(parameter) for name, parameter in self.model.named_parameters()}
-        output, _ = torch.func.functional_call(self.model, weights, (frame.map(move),))
+        # Beside the unit of half precision, rounding in float32 is nothing.
+        model, dtype = (self.model, torch.float64) if unit < _LEAST_OF_HALF else (self._short, torch.float32)
+        weights = {name: move(parameter).to(dtype) for name, parameter in self.model.named_parameters()}
+        output, _ = torch.func.functional_call(model, weights, (frame.map(move).to(dtype),))
         image: Tensor = output.image
         return image
 
@@ -224,7 +225,9 @@ class _Exact:
 
         def change(layer: nn.Module, given: tuple[Any, ...], result: Tensor) -> Tensor:
             assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-            spread = self._squared[layer](given[0].square(), *given[1:]).sqrt()
+            # The copies hardly differ.
+            spread = self._squared[layer](given[0][: len(result) // _DRAWS].square(), *given[1:]).sqrt()
+            spread = spread.repeat(_DRAWS, 1, 1, 1)
             signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
             terms = layer.weight.numel() / layer.out_channels
             if isinstance(layer, nn.ConvTranspose2d):
@@ -240,10 +243,10 @@ class _Exact:
                 handle.remove()
 
 
-def _batch(cases: Sequence[ModelCase]) -> Frame:
-    """The frames of cases of equal size, in float64."""
-    frames = [dict(case.frame().to(torch.float64).items()) for case in cases]
-    return Frame(**{name: torch.cat([frame[name] for frame in frames]) for name in frames[0]})
+def joined(frames: Sequence[Frame]) -> Frame:
+    """Frames as one batch."""
+    buffers = [dict(frame.items()) for frame in frames]
+    return frames[0].replace(**{name: torch.cat([each[name] for each in buffers]) for name in frames[0].buffers})
 
 
 def _with_squared_weights(layer: nn.Module) -> nn.Module:
