@@ -14,6 +14,7 @@ from torch import Tensor
 from mcdenoise.check.cases import OPS, Op
 from mcdenoise.check.stability import _models, check_case, check_denoiser, check_model, check_op, long_runs
 from mcdenoise.check.stability import _ops as op_checks
+from mcdenoise.check.stability._trial import backends
 from mcdenoise.ops import _backend, _op, kernel_conv
 from mcdenoise.ops._op import op, plain
 
@@ -123,8 +124,8 @@ def two_forms(image: Tensor) -> Tensor:
 def test_backends_are_checked_and_unavailable_ones_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_op, "fast_form", lambda page, name: lambda image: 2 * two_forms.plain(image))
     tried = like("downsample", two_forms)
-    assert op_checks.backends(tried) == ("torch", "numba")
-    assert op_checks.backends(BY_NAME["upsample"]) == (None,)
+    assert backends(tried) == ("torch", "numba")
+    assert backends(BY_NAME["upsample"]) == (None,)
     case = tried.cases[0]
     assert all(check.passed for check in check_case(tried, case, torch.float32, "torch"))
     assert not all(check.passed for check in check_case(tried, case, torch.float32, "numba"))

@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any
@@ -40,15 +39,14 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check import gradients
-from mcdenoise.check.case import Case, Inputs, Op, as_tuple, map_tensors, tensors_in
+from mcdenoise.check.case import Case, Op, map_tensors, tensors_in
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.check.stability._rounding import spread
+from mcdenoise.check.stability._trial import Function, Trial, backends
 from mcdenoise.check.step_cases import STEPS
-from mcdenoise.ops import Surface, use
 from mcdenoise.ops._backend import Backend
-from mcdenoise.ops._op import backends_of
 from mcdenoise.ops._window import accumulator_dtype
 from mcdenoise.own import in_one_line
 
@@ -61,70 +59,6 @@ _CONSTANT = 0.7
 # Scaling by powers of two does not round, so results must scale exactly: 1.2e-4 and 8.2e3.
 _EXPOSURES = (2.0**-13, 2.0**13)
 ADJOINTS = (("kernel_conv", "kernel_splat"),)
-
-Function = Callable[[Sequence[Tensor]], list[Tensor]]
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """An op, a case, a dtype and a backend, with the inputs."""
-
-    op: Op
-    case: Case
-    dtype: torch.dtype
-    backend: Backend | None
-    inputs: Inputs
-
-    @property
-    def leaves(self) -> list[Tensor]:
-        """The tensors that are rounded; surfaces are not, because they are only compared."""
-        return tensors_in(self.numbers)
-
-    @property
-    def images(self) -> list[str]:
-        """The op's image arguments that the case has."""
-        return [name for name in self.op.images if name in self.inputs]
-
-    @property
-    def inner(self) -> torch.dtype:
-        """The dtype in which the op computes."""
-        return self.dtype if self.op.own else accumulator_dtype(self.dtype)
-
-    @property
-    def must_be_finite(self) -> bool:
-        """Whether float64 must be finite: a user's function has no other reference, and NaN would excuse any result."""
-        return self.op.own and _all_finite(self.leaves)
-
-    @property
-    def numbers(self) -> Inputs:
-        """The arguments that are rounded."""
-        return {name: value for name, value in self.inputs.items() if not isinstance(value, Surface)}
-
-    def run(self, leaves: Sequence[Tensor]) -> list[Tensor]:
-        """Run the op with other tensors in place of :attr:`leaves`, possibly with several copies of the batch."""
-        remaining = iter(leaves)
-        given = map_tensors(lambda _: next(remaining), self.numbers)
-        surfaces = {name: value for name, value in self.inputs.items() if name not in given}
-        copies = leaves[0].shape[0] // max(self.leaves[0].shape[0], 1) if surfaces else 1
-        repeated = map_tensors(lambda tensor: tensor.to(leaves[0].dtype).repeat(copies, 1, 1, 1), surfaces)
-        # In float64 the op always runs on the first backend, the reference.
-        backend = self.backend if leaves[0].dtype == self.dtype else backends(self.op)[0]
-        with use(backend) if backend else nullcontext():
-            results = self.op.function(**given, **repeated, **self.case.settings)
-        return list(as_tuple(results))
-
-    def gradients(self, leaves: Sequence[Tensor]) -> list[Tensor]:
-        """Gradients of the results; the last of ``leaves`` are the upstream gradients, the others the tensors."""
-        own = [leaf.detach().requires_grad_() for leaf in leaves[: len(self.leaves)]]
-        with torch.enable_grad():
-            results = self.run(own)
-            pairs = [(r, v) for r, v in zip(results, leaves[len(own) :], strict=True) if r.requires_grad]
-            if not pairs:
-                return [torch.zeros_like(leaf) for leaf in own]
-            gradients = torch.autograd.grad(
-                [result for result, _ in pairs], own, [v.to(result.dtype) for result, v in pairs], allow_unused=True
-            )
-        return [torch.zeros_like(x) if g is None else g for x, g in zip(own, gradients, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -148,12 +82,6 @@ def select(names: Sequence[str] | None = None) -> list[Op]:
     # Steps without a batch axis cannot be checked on many inputs at once.
     every = OPS + tuple(step for step in STEPS if step.batched)
     return list(every) if names is None else find_ops(names, every)
-
-
-def backends(op: Op) -> tuple[Backend | None, ...]:
-    """The backends of an op; ``(None,)`` if it has only one."""
-    found = backends_of(op.function)
-    return found if len(found) > 1 else (None,)
 
 
 def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
@@ -217,7 +145,7 @@ def check_case(
     Returns:
         One check of each property that applies; if the backend cannot run, a single check ``"runs"``.
     """
-    trial = _Trial(op, case, dtype, backend, case.inputs(dtype))
+    trial = Trial(op, case, dtype, backend, case.inputs(dtype))
     try:
         results = trial.run(trial.leaves)
     except Exception as error:
@@ -257,7 +185,7 @@ def _once(cache: Cache, what: str, find: Callable[..., list[_Exact]], *arguments
     return cache[what]
 
 
-def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
+def _exact_results(trial: Trial, results: list[Tensor]) -> list[_Exact]:
     """The op's results in float64, with their error bounds."""
     inputs = map_tensors(Tensor.double, trial.inputs)
     rounded = trial.op.rounds(inputs, trial.case.settings)
@@ -273,7 +201,7 @@ def _exact_results(trial: _Trial, results: list[Tensor]) -> list[_Exact]:
     ]
 
 
-def _exact_gradients(trial: _Trial, leaves: list[Tensor], results: list[_Exact]) -> list[_Exact]:
+def _exact_gradients(trial: Trial, leaves: list[Tensor], results: list[_Exact]) -> list[_Exact]:
     """The gradients of the op in float64, which gradcheck compares with finite differences, with their error bounds."""
     exact = [leaf.double() for leaf in leaves]
     if trial.op.own:
@@ -357,7 +285,7 @@ def _bounded(value: Tensor, condition: Tensor, fan_in: Tensor, inner: torch.dtyp
     return _Exact(value, condition, bound)
 
 
-def _compare(trial: _Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
+def _compare(trial: Trial, what: str, results: list[Tensor], exact: list[_Exact]) -> Check:
     """Compare results with exact ones; results beyond the range of the dtype must be infinite, all others finite."""
     values = [truth.value for truth in exact]
     # NaN would excuse any result, and so would infinity.
@@ -409,7 +337,7 @@ def _check_derivative(op: Op, case: Case) -> Check:
     return Check(op.name, case.name, "float64", "", "derivative", 0, 0, 0, result.passed, result.message)
 
 
-def _check_weights(trial: _Trial, weights: Tensor) -> Check:
+def _check_weights(trial: Trial, weights: Tensor) -> Check:
     """Weights are non-negative and sum to one, up to one rounding error per weight and one per tap of the sum."""
     total = weights.double().sum(1)
     allowed = _unit(weights.dtype) + (weights.shape[1] + _DEPTH) * _unit(accumulator_dtype(weights.dtype))
@@ -422,7 +350,7 @@ def _check_weights(trial: _Trial, weights: Tensor) -> Check:
     return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
 
 
-def _check_constant(trial: _Trial, cache: Cache) -> Check:
+def _check_constant(trial: Trial, cache: Cache) -> Check:
     """The forward check with constant images: a mean of equal numbers is that number."""
     inputs = dict(trial.inputs)
     for name in trial.images:
@@ -433,7 +361,7 @@ def _check_constant(trial: _Trial, cache: Cache) -> Check:
     return _compare(constant, "constant", results[:1], exact[:1])
 
 
-def _check_exposure(trial: _Trial, result: Tensor) -> Check:
+def _check_exposure(trial: Trial, result: Tensor) -> Check:
     """``f(s x) = s f(x)``, exactly, as long as no value leaves the range of the dtype."""
     message = ""
     for exposure in _EXPOSURES:
@@ -461,7 +389,7 @@ def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]
     for case in op.cases:
         if case.kind == "extreme":
             continue
-        trial = _Trial(op, case, dtype, None, case.inputs(dtype))
+        trial = Trial(op, case, dtype, None, case.inputs(dtype))
         (name,) = op.images
         x, others = _tensor(trial.inputs[name]), {k: v for k, v in trial.inputs.items() if k != name}
         result = op.function(**{name: x}, **others, **case.settings)
@@ -488,7 +416,7 @@ def _cancellation(kernel: Tensor) -> float:
     return float((kernel.abs().sum(1) / torch.where(total > 0, total, torch.inf)).max().clamp_min(1))
 
 
-def _found(trial: _Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:
+def _found(trial: Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:
     names = (trial.op.name, trial.case.name, name_of(trial.dtype), trial.backend or "")
     return Check(*names, what, error, allowed, condition, not message, message)
 
