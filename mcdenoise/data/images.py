@@ -159,12 +159,21 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
     with _opened(path) as (file, header):
         for part, names in wanted.items():
             found = header.parts[part].channels if part < len(header.parts) else ()
-            if absent := [name for name in names if name not in found]:
-                raise InputError(
-                    f"{path}: expected channel '{absent[0]}', as the first file has it, found "
-                    f"{', '.join(found[:8]) or 'no such part'}; render all frames with the same layers"
-                )
+            check_channels(path, found, names)
         return {part: _read(path, file, part, header.parts[part], names, rows) for part, names in wanted.items()}
+
+
+def check_channels(path: Path, found: Sequence[str], wanted: Sequence[str]) -> None:
+    """Check that a part has all channels that are wanted of it.
+
+    Raises:
+        InputError: one is missing.
+    """
+    if absent := [name for name in wanted if name not in found]:
+        raise InputError(
+            f"{path}: expected channel '{absent[0]}', as the first file has it, found "
+            f"{', '.join(found[:8]) or 'no such part'}; render all frames with the same layers"
+        )
 
 
 def read_picture(path: Path) -> tuple[oiio.ImageSpec, ImageHeader, Image]:

@@ -18,7 +18,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
-from mcdenoise.film.record import Counter
 from mcdenoise.film.summary import Summary, summarize
 from mcdenoise.film.work import RECORDS, Found, Order
 from mcdenoise.results import Results
@@ -204,26 +203,25 @@ def _run(
     run, out = f"{secrets.token_hex(8)}-", Path(os.path.abspath(film.out))
     orders = [Order(each, out, film.joint, film.threads, run) for each in film.shots]
     result = FilmResult([ShotResult(each) for each in film.shots])
-    counters = [Counter(each.records, run) for each in orders]
     pause, counted = _PAUSE, began
 
     def count() -> None:
         nonlocal pause, counted
         if (start := time.monotonic()) - counted >= pause:
-            for each, counter in zip(result.shots, counters, strict=True):
-                each.made = counter.count()
+            for each, order in zip(result.shots, orders, strict=True):
+                each.made = order.made()
             counted = time.monotonic()
             pause = max(_PAUSE, _PAUSES * (counted - start))
             totals = [each.to_make for each in result.shots if not each.reason]
             on_progress(result.made, None if None in totals else sum(filter(None, totals)))
 
     try:
-        made = zip(orders, result.shots, counters, strict=True)
+        made = zip(orders, result.shots, strict=True)
         run_jobs(engine, [_shot(film, *each, on_shot) for each in made], count)
     finally:
         # No worker is alive any more: what is half-written belongs to those that were killed.
-        for order, each, counter in zip(orders, result.shots, counters, strict=True):
-            each.made = counter.count()
+        for order, each in zip(orders, result.shots, strict=True):
+            each.made = order.made()
             for folder in (order.folder, order.records):
                 sweep(folder, youngest=0)
         result.seconds = time.monotonic() - began
@@ -237,7 +235,7 @@ def _run(
     return result
 
 
-def _shot(film: Film, order: Order, result: ShotResult, counter: Counter, on_shot: Callable[[ShotResult], None]) -> Job:
+def _shot(film: Film, order: Order, result: ShotResult, on_shot: Callable[[ShotResult], None]) -> Job:
     """The tasks of a shot: scan it, make what is missing, summarize it; once more for files that changed meanwhile."""
     [(found, result.reason)] = yield [Task(work.scan, (order,), _SCAN)]
     if found is None:
@@ -249,7 +247,7 @@ def _shot(film: Film, order: Order, result: ShotResult, counter: Counter, on_sho
     missing = set(found.numbers) - found.done
     for again in (False, True):
         pieces = cut(found.numbers, missing, film.piece, found.overlap)
-        outcomes = yield [Task(work.make, (order, each), _MAKE, counter.count) for each in pieces]
+        outcomes = yield [Task(work.make, (order, each), _MAKE, order.made) for each in pieces]
         for piece, (failures, reason) in zip(pieces, outcomes, strict=True):
             result.failed.update(dict.fromkeys(piece.wanted, str(reason)) if failures is None else failures)
         [(summary, result.reason)] = yield [Task(summarize, (order,), _SUMMARIZE)]
@@ -265,5 +263,5 @@ def _shot(film: Film, order: Order, result: ShotResult, counter: Counter, on_sho
             result.summary = summary
             break
         result.repeated = len(missing)
-    result.made = counter.count()
+    result.made = order.made()
     on_shot(result)

@@ -122,28 +122,3 @@ def read_records(folder: Path) -> dict[int, FrameRecord]:
                     if record.number not in found or found[record.number].at <= record.at:
                         found[record.number] = record
     return found
-
-
-class Counter:
-    """Counts the frames that a run has finished, while workers add records of them.
-
-    Args:
-        folder: of the journals.
-        run: the beginning of the names of the journals of this run.
-    """
-
-    def __init__(self, folder: Path, run: str) -> None:
-        self._folder, self._run = folder, run
-        self._read: dict[Path, int] = {}
-        self.frames = 0
-
-    def count(self) -> int:
-        """The number of frames."""
-        for path in self._folder.glob(f"{self._run}*.jsonl"):
-            with suppress(OSError), path.open("rb") as file:
-                file.seek(self._read.get(path, 0))
-                # A line that is still being written is counted by the next call.
-                whole, end, _ = file.read().rpartition(b"\n")
-                self._read[path] = self._read.get(path, 0) + len(whole + end)
-                self.frames += sum(line.startswith(b"{") for line in whole.split(b"\n"))
-        return self.frames

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import secrets
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -76,6 +77,15 @@ class Order:
     def records(self) -> Path:
         """The folder of the journals."""
         return self.out / RECORDS / self.shot.name
+
+    def made(self) -> int:
+        """Number of frames that this run has finished, while workers add records of them."""
+        count = 0
+        for path in self.records.glob(f"{self.run}*.jsonl"):
+            with suppress(OSError), path.open("rb") as journal:
+                # A line that is still being written is counted by the next call.
+                count += sum(line.startswith(b"{") and line.endswith(b"\n") for line in journal)
+        return count
 
     def result(self, record: FrameRecord) -> Path:
         """The file of a finished frame, also after the film's folder was moved."""

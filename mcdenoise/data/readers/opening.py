@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import find_camera_matrices
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.images import ImageHeader, Part, Window, read_channels, read_image_header
+from mcdenoise.data.images import ImageHeader, Part, Window, check_channels, read_channels, read_image_header
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
@@ -213,13 +213,8 @@ def _window_in(header: ImageHeader, layer: Layer) -> Window | None:
 
 def _check_window(path: Path, header: ImageHeader, layer: Layer, main: Part, one_window: bool) -> None:
     part = header.parts[layer.part] if layer.part < len(header.parts) else None
-    if part is None or (absent := [channel for channel in layer.channels if channel not in part.channels]):
-        missing = layer.channels[0] if part is None else absent[0]
-        raise InputError(
-            f"{path}: expected channel '{missing}', as the first file has it, found "
-            f"{', '.join(part.channels[:8]) if part else 'no such part'}; render all frames with the same layers"
-        )
-    if part.window != main.window and (one_window or part.display != main.display):
+    check_channels(path, () if part is None else part.channels, layer.channels)
+    if part is not None and part.window != main.window and (one_window or part.display != main.display):
         raise InputError(
             f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
             "buffers and frames at one size, or crop them in one display window, or leave a buffer out with --map"
