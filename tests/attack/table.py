@@ -96,14 +96,9 @@ def page(folder: Path, _: str) -> object:
     return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
 
 
-def rendered(folder: Path, _: str) -> object:
-    """Pixels of the rendered images."""
-    return exr_files(folder / "rendered/inputs")
-
-
-def generated(folder: Path, _: str) -> object:
-    """Pixels of the images of a random scene."""
-    return exr_files(folder / "generated/random0000/inputs")
+def written(place: str) -> Callable[[Path, str], object]:
+    """Pixels of the images in a folder that a command writes."""
+    return lambda folder, _: exr_files(folder / place)
 
 
 def exr_files(folder: Path) -> dict[str, str]:
@@ -157,8 +152,8 @@ COMMANDS = {
     "evaluate model": Command("evaluate shot --model noisy", ("shot",), printed),
     "train": Command(f"train shot -o run {TRAINING}", ("shot", "run"), weights, r"step \d+  loss .*"),
     "report": Command("benchmark -o results", ("results",), page),
-    "render": Command(RENDERING, ("scene", "path.json", "rendered"), rendered, requires="mitsuba"),
-    "generate": Command(GENERATION, ("generated",), generated, requires="mitsuba"),
+    "render": Command(RENDERING, ("scene", "path.json", "rendered"), written("rendered/inputs"), requires="mitsuba"),
+    "generate": Command(GENERATION, ("generated",), written("generated/random0000/inputs"), requires="mitsuba"),
     # If methods fail, the benchmark lists the reasons and ends with status 1.
     "benchmark": Command(COMPARISON, ("shot",), errors, statuses=(0, 1, 2)),
 }
