@@ -10,11 +10,11 @@ prints medians, quartiles and steps per second. As in the command, the process k
 """
 
 import argparse
+import itertools
 import json
 import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import get_args
@@ -36,6 +36,7 @@ from mcdenoise.train.devices import open_fabric
 from mcdenoise.train.front import split
 from mcdenoise.train.loop import Trainer
 from mcdenoise.train.shots import Shot
+from mcdenoise.turns import interleaved
 
 WARM_UP = 2
 
@@ -61,15 +62,32 @@ def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
         return DataFolders.open(config, front, rest.needs, sequences, []).load(Path(cache)).sampler
 
 
-def steps(config: TrainConfig, sampler: ClipSampler) -> Callable[[int], None]:
-    """A function that makes the training step of a number; all start from the same weights."""
+def config_of(model: str, precision: Precision, batch: int, frames: int, crop: int) -> TrainConfig:
+    """The configuration of steps to measure, all of which have as much to do."""
+    return TrainConfig(
+        model=model,
+        batch=batch,
+        frames=frames,
+        crop=crop,
+        precision=precision,
+        gradient_norm=1.0,
+        ema=0.998,
+        draw_resolutions=False,
+        validation_frames=0,
+    )
+
+
+def steps(config: TrainConfig, sampler: ClipSampler, device: str = "cpu") -> Callable[[], float]:
+    """A function that makes the next training step and returns its loss; all start from the same weights."""
     torch.manual_seed(config.seed)
-    fabric = open_fabric("cpu", config.precision, config.batch)
+    fabric = open_fabric(device, config.precision, config.batch)
     losses = {"image": 1.0, "initial": 1.0}
     trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
+    numbers = itertools.count()
 
-    def step(number: int) -> None:
-        trainer.step(number, sampler.draw(trainer.seeds(number)))
+    def step() -> float:
+        number = next(numbers)
+        return trainer.step(number, sampler.draw(trainer.seeds(number)))[0]
 
     return step
 
@@ -91,29 +109,12 @@ def main() -> None:
             raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
     fix_threads(options.threads)
     keep_heap()
-    runs: dict[Precision, Callable[[int], None]] = {}
+    runs: dict[str, Callable[[], object]] = {}
     for precision in get_args(Precision):
-        config = TrainConfig(
-            model=options.model,
-            batch=options.batch,
-            frames=options.frames,
-            crop=options.crop,
-            precision=precision,
-            gradient_norm=1.0,
-            ema=0.998,
-            draw_resolutions=False,
-            validation_frames=0,
-        )
+        config = config_of(options.model, precision, options.batch, options.frames, options.crop)
         check_config(config, 1)
         runs[precision] = steps(config, clips(config, options.sequences))
-
-    times: dict[Precision, list[float]] = {run: [] for run in runs}
-    for number in range(WARM_UP + options.rounds):
-        for run, step in runs.items():
-            start = time.perf_counter()
-            step(number)
-            if number >= WARM_UP:
-                times[run].append((time.perf_counter() - start) * 1e3)
+    times = {run: own[WARM_UP:] for run, own in interleaved(runs, WARM_UP + options.rounds - 1).items()}
 
     machine = describe_machine("cpu")
     size = f"{options.batch} clips of {options.frames} frames of {options.crop}x{options.crop}"

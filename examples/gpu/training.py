@@ -5,55 +5,30 @@ python examples/gpu/training.py -o training.json
 
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import torch
 from part import Part
 
-from mcdenoise.models import DEFAULT, Precision, create_model
-from mcdenoise.train import TrainConfig
-from mcdenoise.train.devices import open_fabric
-from mcdenoise.train.loop import Trainer
+from mcdenoise.models import DEFAULT, Precision
 
 sys.path.append(str(Path(__file__).parents[1]))
-from training_speed import noise
+from training_speed import config_of, noise, steps
 
 SMALLEST = "cascaded_v2_micro"
 
 
-class Steps:
-    """Training steps of a model on clips of noise."""
-
-    def __init__(self, model: str, device: str, precision: Precision, crop: int, batch: int = 4) -> None:
-        config = TrainConfig(
-            model=model,
-            batch=batch,
-            frames=4,
-            crop=crop,
-            precision=precision,
-            gradient_norm=1.0,
-            ema=0.998,
-            draw_resolutions=False,
-            validation_frames=0,
-        )
-        torch.manual_seed(0)
-        network = create_model(model).train()
-        self.trainer = Trainer(
-            config, network, open_fabric(device, precision, batch), {"image": 1.0, "initial": 1.0}, has_state=False
-        )
-        self.sampler, self.done = noise(config), 0
-
-    def __call__(self) -> float:
-        """Run a step; the loss."""
-        loss, _ = self.trainer.step(self.done, self.sampler.draw(self.trainer.seeds(self.done)))
-        self.done += 1
-        return loss
+def steps_of(model: str, device: str, precision: Precision, crop: int, batch: int = 4) -> Callable[[], float]:
+    """A function that makes the next training step of a model on clips of noise, and returns its loss."""
+    config = config_of(model, precision, batch, 4, crop)
+    return steps(config, noise(config), device)
 
 
 def losses(part: Part, device: str) -> list[float]:
     """The losses of the first steps in float32."""
-    step = Steps(SMALLEST, device, "float32", crop=64)
+    step = steps_of(SMALLEST, device, "float32", crop=64)
     return [round(step(), 6) for _ in range(5 if part.quick else 100)]
 
 
@@ -74,7 +49,7 @@ def main() -> None:
         for precision in ("float32", "bfloat16"):
             for batch in (2,) if part.quick else (4, 16):
                 measure = partial(
-                    lambda *given: part.milliseconds(Steps(*given), 10), model, part.device.type, precision
+                    lambda *given: part.milliseconds(steps_of(*given), 10), model, part.device.type, precision
                 )
                 part.attempt(f"{model}, {precision}, {batch} clips of 4x{crop}x{crop}", partial(measure, crop, batch))
     part.attempt("losses", partial(compared, part))

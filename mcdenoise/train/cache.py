@@ -38,7 +38,6 @@ _CAMERA = frozenset({"position", "view_projection"})
 # Patterns of the files of a sequence, relative to its folder.
 _SUFFIXES = {".exr", ".h", ".json"}
 _PLACES = ("*", "noise_seed*/*", "inputs/*", "inputs/noise_seed*/*")
-_FORMAT = 6
 
 # Index of the first frame, and noise seed: each pair has its own colors.
 _Start: TypeAlias = tuple[int, int]
@@ -131,7 +130,7 @@ def open_cached(
     settings = [sequence.numbers, front.settings, kept, firsts, noise_seeds]
     identity = json.dumps([str(sequence.root.resolve()), *settings])
     place = folder / f"{sequence.name[:100]}-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
-    finished = place / _key(sequence.root, [_FORMAT, *settings, found])[:32]
+    finished = place / _key(sequence.root, [*settings, found])[:32]
     if (cached := _load(finished, plan)) is not None:
         return cached
     try:
