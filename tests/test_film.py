@@ -117,6 +117,7 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
 ) -> None:
     def render(name: str, **settings: Any) -> Path:
         changed = {"seed": 5, "film": Film("box"), "noise_seeds": 2, "reference_spp": 2} | settings
+        changed["reference_frames"] = [0]
         return render_sequence(demo_scene(), demo_cameras(2), tmp_path / name, **changed, **SCALAR)
 
     whole, other = render("a"), render("c", seed=6)

@@ -89,9 +89,8 @@ def colonnade(rng: Rng) -> SceneBuilder:
             builder.add([box(roof, (aisle + 2 * radius, 0.2, depth), stone)])
     for end in (-1, 1):
         if rng.random() < 0.75:
-            builder.add(
-                [box((0, floors * height / 2, end * (depth / 2 + 0.15)), (2 * outer, floors * height, 0.3), wall)]
-            )
+            middle = (0, floors * height / 2, end * (depth / 2 + 0.15))
+            builder.add([box(middle, (2 * outer, floors * height, 0.3), wall)])
     for z in np.linspace(-depth / 2, depth / 2, int(rng.integers(2, 6))):
         if rng.random() < 0.5:
             cloth = place((float(rng.choice([-1, 1])) * (width / 2 - radius), height - 0.2, z), 90)
@@ -225,18 +224,16 @@ def wall_with_windows(
     middles = [(number + 0.5) * pitch - length / 2 for number in range(count)]
     edges = [-length / 2 - _WALL, *(x + s * wide / 2 for x in middles for s in (-1, 1)), length / 2 + _WALL]
     for left, right in zip(edges[::2], edges[1::2], strict=True):
-        parts.append(
-            box(((left + right) / 2, (sill + top) / 2, -_WALL / 2), (right - left, top - sill, _WALL), surface)
-        )
+        middle = ((left + right) / 2, (sill + top) / 2, -_WALL / 2)
+        parts.append(box(middle, (right - left, top - sill, _WALL), surface))
     columns, rows = (int(n) for n in rng.integers(0, 4, 2))
     glazed = rng.random() < 0.12
     dressing = rng.choice(["none", "blinds", "curtains"], p=[1 - dressed, 0.4 * dressed, 0.6 * dressed])
+    tall = top - sill
     for x in middles:
-        tall = top - sill
         for n in range(columns):
-            parts.append(
-                box((x + wide * ((n + 1) / (columns + 1) - 0.5), sill + tall / 2, -0.12), (0.04, tall, 0.05), bar)
-            )
+            left = x + wide * ((n + 1) / (columns + 1) - 0.5)
+            parts.append(box((left, sill + tall / 2, -0.12), (0.04, tall, 0.05), bar))
         for n in range(rows):
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
         if glow is not None:
@@ -246,11 +243,8 @@ def wall_with_windows(
             parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
-            tilt = float(rng.uniform(-50, 50))
-            for n in range(slats):
-                parts.append(
-                    box((x, sill + tall * (n + 0.5) / slats, -0.05), (wide, 0.004, tall / slats * 0.9), bar, 0, tilt)
-                )
+            tilt, slat = float(rng.uniform(-50, 50)), (wide, 0.004, tall / slats * 0.9)
+            parts += [box((x, sill + tall * (n + 0.5) / slats, -0.05), slat, bar, 0, tilt) for n in range(slats)]
         elif dressing == "curtains":
             part = wide * float(rng.uniform(0.2, 0.45))
             for side in (-1, 1):

@@ -14,16 +14,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
 from mcdenoise.scenes.random.furniture import glass_block, ornament
-from mcdenoise.scenes.random.materials import (
-    Bsdf,
-    diffuse,
-    glass,
-    lacquer,
-    mirror,
-    pane,
-    random_metal,
-    rough_plastic,
-)
+from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, lacquer, mirror, pane, random_metal, rough_plastic
 from mcdenoise.scenes.random.textures import planks, texture
 
 Rng = np.random.Generator
@@ -110,9 +101,7 @@ def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
     tilt = rotate("x", float(rng.uniform(-4, 8)) if rng.random() < 0.4 else 0.0)
     parts = [sheet((0, 0, 0.06), half_size, builder.material(silver), tilt)]
     if rng.random() < 0.7:
-        rim = builder.material(
-            lacquer(texture(rng), (1, 1), nonlinear=True) if rng.random() < 0.5 else random_metal(rng)
-        )
+        rim = builder.material(lacquer(texture(rng), nonlinear=True) if rng.random() < 0.5 else random_metal(rng))
         parts.append(box((0, 0, 0.01), (2 * half_size[0] + 0.1, 2 * half_size[1] + 0.1, 0.02), rim))
         for side in (-1, 1):
             parts.append(box((side * (half_size[0] + 0.03), 0, 0.05), (0.06, 2 * half_size[1] + 0.1, 0.08), rim))
@@ -196,7 +185,7 @@ def _jewels(builder: SceneBuilder, rng: Rng) -> None:
         else:
             shell = mirror(str(rng.choice(["Ag", "Au", "Cu"]))) if kind < 0.6 else random_metal(rng)
             if kind > 0.85:
-                shell = lacquer(_contrast(rng, texture(rng)), (1, 1), nonlinear=True)
+                shell = lacquer(_contrast(rng, texture(rng)), nonlinear=True)
             material = builder.material(shell)
             parts = [ball((0, size / 2, 0), size / 2, material)]
             if rng.random() < 0.3:
@@ -213,11 +202,9 @@ def _lacquered_box(builder: SceneBuilder, rng: Rng) -> None:
     wood = planks(rng) if rng.random() < 0.7 else texture(rng)
     dark = np.clip(wood * rng.uniform(0.05, 0.5), 0.003, 0.9)
     tiling = (float(rng.integers(1, 4)), float(rng.integers(1, 4)))
-    coat = (
-        lacquer(dark, tiling, nonlinear=True)
-        if rng.random() < 0.6
-        else rough_plastic(dark, float(rng.uniform(0.02, 0.15)), tiling)
-    )
+    coat = lacquer(dark, tiling, nonlinear=True)
+    if rng.random() >= 0.6:
+        coat = rough_plastic(dark, float(rng.uniform(0.02, 0.15)), tiling)
     frame = place(where, turn)
     builder.add([box((0, tall / 2, 0), (wide, tall, deep), builder.material(coat))], frame)
     for _ in range(int(rng.integers(1, 4))):

@@ -121,7 +121,7 @@ class SequenceFolder:
         self._description = self.path / "camera.json"
         before = self._read(settings) if self._description.is_file() else {}
         self._settings = {**_merged(before, settings), **_ALWAYS, **conventions}
-        self.references = self._find_references()
+        self.references = self._find_references(before.get("reference_spp", {}))
         self._write()
         matrices = CameraMatrices(
             np.array(self._settings["camera_matrices"]),
@@ -167,7 +167,7 @@ class SequenceFolder:
                     )
         return before
 
-    def _find_references(self) -> dict[int, ReferenceState]:
+    def _find_references(self, known_spp: Mapping[str, int]) -> dict[int, ReferenceState]:
         """Read the states of references from their headers, which are written together with the pixels."""
         found: dict[int, ReferenceState] = {}
         for number in range(self._settings["frames"]):
@@ -177,6 +177,9 @@ class SequenceFolder:
                 continue
             header = read_image_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
+            if spp is None:
+                # Older versions wrote no number of passes: there cannot be more passes than paths.
+                spp = passes = known_spp.get(str(number))
             if not isinstance(spp, int) or not isinstance(passes, int):
                 raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
             found[number] = ReferenceState(spp, passes, noise if isinstance(noise, float) else None)
