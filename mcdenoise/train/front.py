@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -133,5 +134,6 @@ def split(model: Model) -> tuple[Front, Model]:
 
 
 def _settings(wrapper: Wrapper) -> dict[str, Any]:
-    """The constructor arguments of a wrapper, which it stores under the same names."""
-    return {name: value for name, value in vars(wrapper).items() if not name.startswith("_") and name != "training"}
+    """The constructor arguments of a wrapper but the model inside, which it stores under the same names."""
+    _, *names = inspect.signature(type(wrapper)).parameters
+    return {name: getattr(wrapper, name) for name in names}
