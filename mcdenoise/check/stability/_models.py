@@ -17,6 +17,7 @@ from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Accumulated, Skipping, parts_of
+from mcdenoise.ops import use
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 8
@@ -171,7 +172,8 @@ class _Exact:
             if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)
         }
         self._frames = {case.name: case.frame().to(torch.float64) for case in cases}
-        self.images = {name: _image(self.model, frame) for name, frame in self._frames.items()}
+        with use("torch"):
+            self.images = {name: _image(self.model, frame) for name, frame in self._frames.items()}
         # The largest changes of the images when convolutions are summed in float32.
         self.sums = self._largest([[name] for name in self.images], [self._summed])
         self._products: dict[float, dict[str, float]] = {}
@@ -194,7 +196,10 @@ class _Exact:
         for names in batches:
             frame = joined([self._frames[name] for name in names])
             for change in changes:
-                for name, image in zip(cycle(names), change(frame).split(1), strict=False):
+                # Like the image, also where a batch is large enough for another backend.
+                with use("torch"):
+                    images = change(frame)
+                for name, image in zip(cycle(names), images.split(1), strict=False):
                     found[name] = max(found[name], relative_change(image, self.images[name]))
         return found
 
