@@ -154,9 +154,9 @@ def test_the_pixel_network_written_out(size: tuple[int, int]) -> None:
     assert expected.abs().max() > 0.1
 
 
-@pytest.mark.parametrize("normalize", ["softmax", "none"])
-@pytest.mark.parametrize("bilateral", [True, False])
-@pytest.mark.parametrize("kernel_size", [3, 5])
+@pytest.mark.parametrize(
+    ("kernel_size", "bilateral", "normalize"), [(3, True, "softmax"), (5, False, "softmax"), (3, True, "none")]
+)
 @torch.no_grad()
 def test_the_kernel_network_written_out(kernel_size: int, bilateral: bool, normalize: Any) -> None:
     """Eqs. 3 to 8, and their fusion by Eq. 2."""
@@ -200,8 +200,7 @@ def test_the_whole_method_written_out() -> None:
     torch.testing.assert_close(output.image, (final / exposure).clamp_min(0) * divisor, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.parametrize("normalize", ["softmax", "none"])
-@pytest.mark.parametrize("bilateral", [True, False])
+@pytest.mark.parametrize(("bilateral", "normalize"), [(True, "softmax"), (False, "none")])
 @pytest.mark.parametrize("cascade", ["P", "K", "P+K", "K+P", "K+K"])
 @torch.no_grad()
 def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:

@@ -85,7 +85,7 @@ def test_a_model_says_what_it_needs(name: str) -> None:
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_images_of_any_size(name: str, size: tuple[int, int]) -> None:
     model, state = small(name), None
@@ -192,7 +192,7 @@ def test_the_declared_needs_suffice(name: str) -> None:
 
 
 @pytest.mark.parametrize("bare", [False, True], ids=["", "bare"])
-@pytest.mark.parametrize("factor", [2.0**-20, 1e-1, 2.0**20])
+@pytest.mark.parametrize("factor", [2.0**-20, 1e5])
 @pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_exposure_only_scales_the_result(name: str, factor: float, bare: bool) -> None:
@@ -329,7 +329,7 @@ def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
     far = ratios(192, 192)[..., 64:128, 64:128]
     level = far.mean((2, 3), keepdim=True)
     bound = 0.025 + 2 * float((far - level).abs().max())
-    for size in ((1, 1), (1, 7), (3, 5), (16, 16), (17, 31), (33, 1), (96, 128)):
+    for size in ((1, 1), (3, 5), (17, 31), (33, 1), (96, 128)):
         assert float((ratios(*size) / level - 1).abs().max()) < bound, size
 
 
