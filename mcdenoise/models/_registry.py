@@ -116,10 +116,14 @@ def _build_model(name: str, settings: dict[str, Any]) -> Model:
                 f"a function that returns it, or else default values, or settings: '{name}({required[0]}=...)'"
             ) from error
         raise InputError(f"model '{name}': {error}; it takes {', '.join(parameters) or 'no settings'}") from error
-    if entry.of_zoo:
-        return as_model(entry.construct(**arguments))
+    for key, value in arguments.items() if entry.of_zoo else ():
+        # Layers without features are possible in torch.
+        if key.endswith("width") and isinstance(value, int) and value < 1:
+            raise InputError(f"model '{name}': {key}: expected at least 1, found {value}")
+    given = ", ".join(f"{key}={value}" for key, value in settings.items())
+    reason = f"expected settings that fit, found {given or 'none'}" if entry.of_zoo else "the factory fails"
     try:
-        with refused(f"model '{name}': the factory fails"):
+        with refused(f"model '{name}': {reason}"):
             return as_model(entry.construct(**arguments))
     except InputError as error:
         if not str(error).startswith("model: "):

@@ -119,15 +119,11 @@ def load_weights(path: Path, name: str | None = None, **settings: Any) -> Model:
                 _check_shapes(path, found, _shapes(outline_model(name, every)), shapes)
             with without_draws():
                 model = build_model(name, **every)
-        except (TypeError, ValueError, RuntimeError, ArithmeticError, LookupError, MemoryError) as error:
-            if isinstance(error, InputError) and str(error).startswith(f"{path}: "):
-                raise
+        except InputError as error:
             # Settings that are given are not the file's mistake.
-            where, given = ("", settings) if settings else (f"{path}: ", description["settings"])
-            reason = (
-                str(error) if isinstance(error, InputError) else f"expected settings of model '{found}', found {given}"
-            )
-            raise InputError(f"{where}{reason}") from error
+            if settings or str(error).startswith(f"{path}: "):
+                raise
+            raise InputError(f"{path}: {error}") from error
         _check_shapes(path, found, _shapes(model), shapes)
         tensors = {key: file.get_tensor(key) for key in keys}
     if description.get("sha256") != _digest(tensors):

@@ -89,8 +89,6 @@ class KpcnNetwork(Network):
 
     def __init__(self, width: int = 24, layers: int = 5, kernel_size: int = 11, split: bool = True) -> None:
         super().__init__()
-        if width < 1:
-            raise InputError(f"width: expected at least 1, found {width}")
         if layers < 2:
             raise InputError(f"layers: expected at least 2, found {layers}")
         check_odd(kernel_size)

@@ -19,6 +19,7 @@ from torch.utils import _pytree as pytree
 from toys import one_of_each, refused, small, whole_frame
 
 from mcdenoise import Frame
+from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Hints, scale_samples
 from mcdenoise.models import (
     DEFAULT,
@@ -532,6 +533,13 @@ def test_saved_and_loaded_in_half_precision(weights: Path) -> None:
     torch.testing.assert_close(after, before, rtol=1e-2, atol=1e-2)
 
 
+def test_widths_without_channels_are_refused() -> None:
+    for name in (each for each in list_models() if "width" in find_model(each).architecture):
+        for width in (-1, 0, "wide"):
+            with pytest.raises(InputError, match="width"):
+                create_model(name, width=width)
+
+
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
@@ -606,7 +614,7 @@ def test_a_layer_of_another_shape_is_named(weights: Path) -> None:
         ("settings", {"half": "a" * 1000}, "expected for 'half'"),
         # A model of this width takes 5 GB.
         ("settings", {"width": 4000}, "expects "),
-        ("settings", {"width": -1}, "expected settings of model 'cascaded_v2', found {'width': -1"),
+        ("settings", {"width": -1}, "width: expected at least 1, found -1"),
         ("settings", '{"width": 8}', "found no half, kernel_size, kernel_width, resolutions; save the weights again"),
     ],
 )
