@@ -170,7 +170,8 @@ def _read(path):
     parts = []
     while file.seek_subimage(len(parts), 0):
         spec, end = oiio.ImageSpec(file.spec()), file.spec().y + file.spec().height
-        strips = [(top, min(top + _ROWS, end)) for top in range(spec.y, end, _ROWS)]
+        step = spec.height if spec.tile_width else _ROWS
+        strips = [(top, min(top + step, end)) for top in range(spec.y, end, step)]
         read = [file.read_scanlines(len(parts), 0, *strip, 0, 0, spec.nchannels, "float") for strip in strips]
         if any(strip is None for strip in read):
             raise FrameError(f"{path}: cannot be read: {file.geterror()}")

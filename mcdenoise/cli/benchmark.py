@@ -97,7 +97,7 @@ def benchmark(
         rounds=rounds,
         threads=threads,
         device=device,
-        sizes=tuple(parse_sizes(sizes or SIZES)),
+        sizes=tuple(parse_sizes(SIZES if sizes is None else sizes)),
         pictures=pictures,
         command=command,
     )

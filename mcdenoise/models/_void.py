@@ -114,7 +114,8 @@ def with_void(output: Output, frame: Frame, void: Void) -> Output:
             surface = (alpha > 0) if mask is None else (alpha > 0) | mask
             multiplier = torch.where(surface, after, alpha).clamp(_LEAST, 1.0)
             multiplier = torch.where(void.divided, multiplier, 1)
-            output = output.lit(lambda image: image * multiplier)
+            shape = output.image.shape
+            output = output.lit(lambda image: image * multiplier if image.shape == shape else image)
             # A pixel that only noise left empty has the light of the surface.
             mask = None if mask is None else mask & ((after <= 0) | (alpha > 0))
     if mask is None:

@@ -133,7 +133,8 @@ def _known(frame: Frame, output: Output) -> Output:
 
     stages = {name: known(name, image) for name, image in output.stages.items()}
     layers = {name: frame.layers[name].to(layer.dtype, copy=True) for name, layer in output.layers.items()}
-    alpha = None if output.alpha is None or frame.alpha is None else frame.alpha.to(output.alpha.dtype, copy=True)
+    before = frame.color[:, :1] if frame.alpha is None else frame.alpha
+    alpha = None if output.alpha is None else before.to(output.alpha.dtype, copy=True)
     return Output(known("image", output.image), stages, layers, alpha, output.notes)
 
 

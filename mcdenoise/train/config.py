@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args, get_type_hints
 
 import msgspec
 from msgspec import Meta
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.models import DEFAULT, Precision
 from mcdenoise.train.losses import Loss
 
@@ -122,6 +124,19 @@ class TrainConfig:
         return warm_up * 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.steps)))
 
 
+def told(error: msgspec.ValidationError, kinds: Mapping[str, Any]) -> str:
+    """The place of a wrong value, what was expected there and what was found, with the types of all keys."""
+    what, _, place = str(error).replace("`", "").partition(" - at $.")
+    key = place.rpartition(".")[2]
+    if what.startswith("Invalid enum value ") and key in kinds:
+        known = ", ".join(map(str, get_args(kinds[key])))
+        what = what.replace("Invalid enum value", f"expected one of {known}, found")
+    elif near := did_you_mean(what.rpartition(" ")[2], kinds) if "unknown field" in what else "":
+        what = f"{what}; {near}"
+    place = re.sub(r"^(\w+)\[(\d+)\]", lambda found: f"[[{found[1]}]] {int(found[2]) + 1}", place)
+    return f"{place}: {what[0].lower()}{what[1:]}" if place else f"{what[0].lower()}{what[1:]}"
+
+
 def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     """Check that every setting is valid.
 
@@ -131,8 +146,8 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
     try:
         msgspec.convert(dataclasses.asdict(config), TrainConfig)
     except msgspec.ValidationError as error:
-        what, _, name = str(error).replace("`", "").rpartition(" - at $.")
-        raise InputError(f"{name}: {what[0].lower()}{what[1:]}, found {getattr(config, name)}") from error
+        name, _, what = told(error, get_type_hints(TrainConfig)).partition(": ")
+        raise InputError(f"{name}: {what.partition(', found ')[0]}, found {getattr(config, name)}") from error
     # A lamp is two pixels wide, and needs more than one possible position.
     for name, low in {"frames": 2 if config.temporal_weight else 1, "crop": 3 if config.lamps else 1}.items():
         if getattr(config, name) < low:

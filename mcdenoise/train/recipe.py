@@ -36,7 +36,7 @@ from mcdenoise.methods import check_names_no_code
 from mcdenoise.models import create_model
 from mcdenoise.reading import read_text
 from mcdenoise.train.cache import locked
-from mcdenoise.train.config import TrainConfig, check_config
+from mcdenoise.train.config import TrainConfig, check_config, told
 from mcdenoise.train.references import clean_references
 
 _CLEAN = "clean_references"
@@ -220,7 +220,8 @@ def naming(where: str) -> Iterator[None]:
 
 def _parsed(path: Path, options: Collection[str]) -> dict[str, Any]:
     """The tables of a recipe, with known keys and values of the right types only."""
-    settings = [(name, kind, UNSET) for name, kind in get_type_hints(TrainConfig, include_extras=True).items()]
+    kinds = get_type_hints(TrainConfig, include_extras=True)
+    settings = [(name, kind, UNSET) for name, kind in kinds.items()]
     expected = _table({"smape": float, "tolerance": float})
     run = _table({"name": _Name}, *settings, ("expected", expected, UNSET), ("seeds", _some(int), UNSET))
     # A recipe may do without assets.
@@ -239,8 +240,8 @@ def _parsed(path: Path, options: Collection[str]) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: expected a recipe, found no file that can be read ({error.strerror})") from error
     except msgspec.ValidationError as error:
-        what, _, place = str(error).replace("`", "").partition(" - at $.")
-        raise InputError(f"{path}: {f'{place}: ' if place else ''}{what[0].lower()}{what[1:]}") from error
+        kinds = chosen if any(f"$.{each}[" in str(error) for each in ("data", "validation")) else kinds
+        raise InputError(f"{path}: {told(error, kinds)}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: expected a recipe in TOML, found: {error}") from error
     return content
@@ -252,7 +253,7 @@ def _table(required: Mapping[str, Any], *optional: tuple[str, Any, Any]) -> Any:
 
 def _some(kind: Any, least: int = 1) -> Any:
     """The type of a list with as many elements at least."""
-    return Annotated.__class_getitem__((GenericAlias(list, kind), Meta(min_length=least)))  # type: ignore[attr-defined]
+    return Annotated[GenericAlias(list, kind), Meta(min_length=least)]
 
 
 def _renderings(path: Path, name: str, tables: list[dict[str, Any]]) -> list[Rendering]:

@@ -184,6 +184,9 @@ def _difference(path: Path, content: Any) -> str:
         stored = json.loads(read_text(path, _LARGEST))
         # Numbers and tuples as a file has them.
         wanted = json.loads(_json(content))
+        # A width was a setting of its own.
+        if path.name == "config.json" and (width := stored.pop("width", 0)):
+            stored["settings"] = ",".join(filter(None, [stored.get("settings"), f"width={width}"]))
         # A run of an earlier version has settings that are gone.
         names = wanted if path.name == "config.json" else {**wanted, **stored}
         other = [name for name in names if stored.get(name) != wanted.get(name)]
