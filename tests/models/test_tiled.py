@@ -14,7 +14,7 @@ from toys import Blur, Brightest, Mean, Same, frame_of, refused, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import Skip
-from mcdenoise.models import Exposed, FromBuffers, Needs, Region, Tiled, parts_of, prepared
+from mcdenoise.models import Exposed, FromBuffers, Needs, Output, Region, Tiled, parts_of, prepared
 from mcdenoise.models._memory import Frames, Memory, Network, Tiling
 from mcdenoise.models.tiled import regions
 from mcdenoise.ops._window import mirrored
@@ -24,6 +24,17 @@ CPU = torch.device("cpu")
 
 
 # The same images
+
+
+def test_a_method_may_find_an_alpha_in_tiles() -> None:
+    def opaque(frame: Frame, state: Any = None) -> Any:
+        return Output(frame.color, alpha=frame.color[:, :1] / 2), None
+
+    opaque.needs = Needs(trainable=False, reach=0)  # type: ignore[attr-defined]
+    color = torch.rand(1, 3, 70, 80)
+    output = Tiled(opaque, side=32)(Frame(color))[0]  # type: ignore[arg-type]
+    assert output.alpha is not None
+    assert torch.equal(output.alpha, color[:, :1] / 2)
 
 
 @pytest.mark.parametrize(("precision", "tile"), [("float32", 64), ("float32", 160), ("bfloat16", 96)])

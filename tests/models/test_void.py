@@ -11,6 +11,7 @@ from toys import Same, refused
 import mcdenoise
 from mcdenoise import Denoiser, Frame
 from mcdenoise.frame import Hints
+from mcdenoise.models import Needs, Output
 from mcdenoise.models._void import _islands, with_void, without_void
 
 
@@ -118,6 +119,18 @@ def test_color_and_alpha_are_one_pair(model: object) -> None:
     torch.testing.assert_close(output.image, output.alpha * red, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(output.alpha, cover)
     torch.testing.assert_close(output.layers["half"], output.image / 2, rtol=1e-3, atol=1e-5)
+
+
+def test_a_stage_of_another_size_stays() -> None:
+    color, alpha = torch.rand(1, 3, 16, 24), torch.rand(1, 1, 16, 24)
+
+    def model(frame: Frame, state: object = None) -> tuple[Output, None]:
+        return Output(blur(frame.color), {"half": torch.ones(1, 3, 8, 12)}), None
+
+    model.needs = Needs(trainable=False)  # type: ignore[attr-defined]
+    assert torch.equal(
+        Denoiser(model, alpha=True).output(Frame(color, alpha=alpha)).stages["half"], torch.ones(1, 3, 8, 12)
+    )
 
 
 def covers(kind: str) -> Tensor:
