@@ -147,6 +147,7 @@ class SequenceFolder:
             moves = {identity: list(path) for identity, path in before.get("moves", {}).items()}
             common = min(int(before["frames"]), settings["frames"])
             paths = {key: [before[key][number] for number in range(common)] for key in _POSES}
+            before["reference_spp"] = dict(before.get("reference_spp", {}))
         except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
