@@ -93,18 +93,18 @@ def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> 
         # A graph for any image size cannot branch on it.
         if torch.compiler.is_compiling() or before or after:
             ends = [
-                image.index_select(dim, _mirrored(torch.arange(*place, device=image.device), size))
+                image.index_select(dim, mirrored_places(torch.arange(*place, device=image.device), size))
                 for place in ((-before, 0), (size, size + after))
             ]
             image = torch.cat([ends[0], image, ends[1]], dim)
     return image
 
 
-def _mirrored(place: Tensor, size: int) -> Tensor:
+def mirrored_places(place: Tensor, size: int) -> Tensor:
     """The places in an image of some size that are shown at places outside, by mirrors at both ends."""
     # Graphs in ONNX divide by no number that is a size.
     place = place % torch.full_like(place, 2 * size)
-    return torch.where(place < size, place, 2 * size - 1 - place)
+    return torch.minimum(place, 2 * size - 1 - place)
 
 
 def corner(image: Tensor, height: int, width: int) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._window import mirrored_places
 
 BLOCK = 32
 # The fit changes the part of the image that the features explain by this fraction: less than float32 rounds.
@@ -84,7 +85,8 @@ def block_regression(
     if image.numel() == 0:
         return image
     rows, columns = (
-        _mirrored(size, block, start, image.device)
+        # As many whole blocks as cover the axis.
+        mirrored_places(torch.arange(-start, -(-(size + start) // block) * block - start, device=image.device), size)
         for size, start in zip((sizes["H"], sizes["W"]), offset, strict=True)
     )
     both = torch.cat([features.to(torch.float64), image.to(torch.float64)], 1)
@@ -120,13 +122,6 @@ def _check_settings(block: int, offset: tuple[int, int], squares: int, ridge: fl
 
 
 BlockRegression = module_of("BlockRegression", block_regression, _check_settings)
-
-
-def _mirrored(size: int, block: int, start: int, device: torch.device) -> Tensor:
-    """Index of the pixel at each place of the blocks along an axis."""
-    length = -(-(size + start) // block) * block
-    place = (torch.arange(length, device=device) - start) % (2 * size)
-    return torch.minimum(place, 2 * size - 1 - place)
 
 
 def _to_blocks(image: Tensor, block: int, grid: tuple[int, int]) -> Tensor:

@@ -134,7 +134,7 @@ def told(error: msgspec.ValidationError, kinds: Mapping[str, Any]) -> str:
     elif near := did_you_mean(what.rpartition(" ")[2], kinds) if "unknown field" in what else "":
         what = f"{what}; {near}"
     place = re.sub(r"^(\w+)\[(\d+)\]", lambda found: f"[[{found[1]}]] {int(found[2]) + 1}", place)
-    return f"{place}: {what[0].lower()}{what[1:]}" if place else f"{what[0].lower()}{what[1:]}"
+    return f"{f'{place}: ' if place else ''}{what[0].lower()}{what[1:]}"
 
 
 def check_config(config: TrainConfig, checkpoint_every: int) -> None:
