@@ -12,11 +12,16 @@ import warnings
 from contextlib import redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from commands import succeeds
+from numpy.typing import NDArray
 
 from mcdenoise import create_model
 from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data.shards import write_shard
+from mcdenoise.models import describe_weights
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RENDERERS = Path(__file__).parent / "data" / "renderers"
@@ -324,17 +329,41 @@ def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
     assert "failed" in ends["ops"]
 
 
-@pytest.mark.slow
-def test_training_for_minutes_ends_with_weights_and_goes_on(small_sequence: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def packed(tmp_path: Path) -> Path:
+    """A folder of parts with a shot and a larger still, whose light is less noisy with a longer history."""
+    generator = np.random.default_rng(0)
+
+    def image(*shape: int) -> NDArray[np.float32]:
+        return generator.random(shape, np.float32)
+
+    (tmp_path / "takes").mkdir()
+    for number, (frames, references, *size) in enumerate([(13, 2, 128, 192), (1, 1, 128, 400)]):
+        wall = {"albedo": np.full((frames, 3, *size), 0.5), "normal": np.ones((frames, 3, *size))}
+        wall |= {"depth": np.ones((frames, 1, *size)), "motion": np.zeros((frames, 2, *size))}
+        light = {"color": image(frames, 3, *size), "reference": np.full((references, 3, *size), 0.5)}
+        write_shard(tmp_path / "takes" / f"{number}.take.npz", {"credits": ["sky (Ann, CC0)"]}, wall | light)
+    run("gpu/pack.py", tmp_path / "takes", "-o", tmp_path / "packed")
+    return tmp_path / "packed"
+
+
+def test_packed_takes_are_tiles_with_two_histories(packed: Path) -> None:
+    tiles = runpy.run_path(str(EXAMPLES / "gpu" / "train.py"))["Tiles"](packed, torch.device("cpu"))
+    assert [(take["frames"], take["histories"]) for take in tiles.takes] == [(2, 2), (1, 1), (1, 1)]
+    long, short = tiles.history[:2], tiles.history[2:4]
+    assert long[:, 3].max() == 13
+    assert short[:, 3].max() < 13
+    assert long[:, :3].std() < short[:, :3].std() <= tiles.fixed[:2, :3].std()
+    assert torch.equal(tiles.fixed[:, -3:], torch.full_like(tiles.fixed[:, -3:], 0.5))
+
+
+def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "recipe.toml"
-    recipe.write_text(
-        '[train]\nmodel = "cascaded_v2_micro"\nbatch = 1\nframes = 2\ncrop = 16\nvalidation_frames = 0\n'
-        '[[data]]\nseeds = "0"\n'
-    )
-    arguments = (small_sequence, "-o", tmp_path / "out", "--recipe", recipe, "--minutes", "0.5", "--device", "cpu")
-    first, *_, weights = run("gpu/train.py", *arguments).splitlines()
-    assert int(first.split()[0]) >= 1
-    assert create_model("cascaded_v2_micro", weights=Path(weights)) is not None
-    assert (tmp_path / "out" / "run" / "checkpoint.pt").exists()
-    # It is done already.
-    assert run("gpu/train.py", *arguments).splitlines() == [first, weights]
+    recipe.write_text('[train]\nmodel = "wild_small"\ncrop = 32\nlamps = 0.5\nkey = 0.2\n[[data]]\nseeds = "0"\n')
+    options = ("--recipe", recipe, "--seconds", "4", "--clips", "2", "--device", "cpu", "--validation", packed)
+    *_, weights = run("gpu/train.py", packed, "-o", tmp_path / "out", *options).splitlines()
+    assert create_model("wild_small", weights=Path(weights)) is not None
+    first, *_, last = map(json.loads, (tmp_path / "out" / "log.jsonl").read_text().splitlines())
+    assert first["step"] == 0 < last["step"]
+    assert set(last["takes"]) == {"0", "1"}
+    assert "Ann, CC0" in describe_weights(Path(weights))["data"]

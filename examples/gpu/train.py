@@ -1,79 +1,330 @@
-"""Train a run of a recipe for a given number of minutes, however fast the machine is.
+"""Train a run of a recipe on a GPU that holds all takes in its memory, for a given number of seconds.
 
-    python examples/gpu/train.py TAKES... -o OUT --recipe recipes/wild.toml --run base --minutes 8
+    python examples/gpu/pack.py TAKES... -o packed
+    python examples/gpu/pack.py UNSEEN... -o packed-unseen
+    python examples/gpu/train.py packed -o OUT --recipe recipes/wild.toml --run base --validation packed-unseen
 
-TAKES are folders of packed takes, or of sequences. Some steps are timed first, in OUT/pace; then as many as the minutes
-allow run with the recipe's schedule, in OUT/run, which ends with the weights, the checkpoint with the optimiser, and
-the log. The same command again goes on with an interrupted run.
+Parts may be added to the folder while it runs. Clips are drawn and augmented on the GPU, many at once, as
+:class:`mcdenoise.train.ClipSampler` draws them one by one; the learning rate follows the clock. The loss of a clip is
+the logarithm of its errors, so that a clip with little noise counts as much as one with much: what is reported of a
+method is the geometric mean of ratios. OUT has the averaged weights, which are written again at each validation, and
+the log.
 """
 
 import argparse
+import copy
 import json
+import math
+import random
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pack import TILE
+from torch import Tensor, nn
 
 from mcdenoise.cli.train import options_of
-from mcdenoise.data.files import write_json
+from mcdenoise.commit import source_commit
+from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
-from mcdenoise.train import TrainConfig, train
-from mcdenoise.train.loop import Progress
+from mcdenoise.frame import Frame
+from mcdenoise.methods import parse_method
+from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
+from mcdenoise.models import create_model, save_weights, start_with
+from mcdenoise.nn.inputs import auto_exposure
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.train import TrainConfig
+from mcdenoise.train.front import split
+from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
 
-# The first report of a run includes what is compiled and loaded once.
-PACE, REPORTED = 150, 50
-# Of the minutes, for the last checkpoint and what differs from step to step.
-RESERVE = 0.95
+FRAMES = 2
+LOOK = 20.0  # seconds between validations, and looks for new parts
+WARM_UP = 200
+RELATIVE = 0.01  # added to the error of a clip before its logarithm is taken
+BARE = 0.06  # probability that a clip has no normal, and half that of one without albedo
+YOUNG = 0.1  # probability that a clip has no history
+CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 
-def pace(config: TrainConfig, sequences: list[Path], out: Path, cache: Path, device: str) -> float:
-    """Seconds of a training step."""
-    seconds: list[float] = []
+@dataclass
+class Tiles:
+    """All tiles of a folder of parts, on the device.
 
-    def report(progress: Progress) -> None:
-        seconds.append(progress.seconds)
+    Args:
+        folder: of parts.
+        device: that holds them.
+    """
 
-    trial = replace(config, steps=PACE)
-    train(trial, sequences, out, cache=cache, accelerator=device, checkpoint_every=PACE, report=report)
-    return (seconds[-1] - seconds[0]) / (PACE - REPORTED)
+    folder: Path
+    device: torch.device
+    fixed: Tensor = field(init=False)
+    history: Tensor = field(init=False)
+    takes: list[dict[str, Any]] = field(default_factory=list)
+    credits: set[str] = field(default_factory=set)
+    read: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.fixed = torch.empty(0, sum(CHANNELS.values()), *TILE, dtype=torch.float16, device=self.device)
+        self.history = torch.empty(0, 4, *TILE, dtype=torch.float16, device=self.device)
+        self.update()
+
+    def update(self) -> bool:
+        """Read the parts that have come; whether there are any."""
+        new = sorted(path for path in self.folder.glob("*.npz") if path.name not in self.read)
+        for path in new:
+            with np.load(path, allow_pickle=False) as part:
+                about = json.loads(part["about"].tobytes())
+                fixed, history = (self._joined(part, name) for name in ("fixed", "history"))
+            first, begun = len(self.fixed), len(self.history)
+            for take in about["index"]:
+                self.takes.append({**take, "first": first, "begun": begun})
+                first, begun = first + take["frames"], begun + take["frames"] * take["histories"]
+            self.fixed, self.history = torch.cat([self.fixed, fixed]), torch.cat([self.history, history])
+            self.credits.update(about["credits"])
+            self.read.add(path.name)
+        if new:
+            rows = [[take[name] for name in ("first", "begun", "frames", "histories")] for take in self.takes]
+            self.table = torch.tensor(rows, device=self.device)
+        return bool(new)
+
+    def _joined(self, part: Any, name: str) -> Tensor:
+        low, high = (torch.from_numpy(part[f"{name}.{byte}"]).to(self.device) for byte in (0, 1))
+        return torch.stack([low, high], -1).view(torch.float16)[..., 0]
+
+    def frames(self, take: dict[str, Any]) -> tuple[Frame, Tensor]:
+        """The frames of a tile with the whole history, and their reference."""
+        own = slice(take["first"], take["first"] + take["frames"])
+        begun = slice(take["begun"], take["begun"] + take["frames"])
+        return framed(self.fixed[own].float(), self.history[begun].float())
+
+    def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor, Tensor]:
+        """Draw clips: their frames as a batch, references, and whether the frames of a clip follow each other."""
+        rand = torch.rand(8, clips, device=self.device)
+        # As often as it has frames.
+        drawn = torch.multinomial(self.table[:, 2].float(), clips, replacement=True)
+        first, begun, frames, histories = self.table[drawn].unbind(1)
+        moving = frames > 1
+        t = (rand[0] * (frames - FRAMES + 1).clamp_min(1)).long()
+        t = torch.stack([t, t + moving], 1)
+        when = (first[:, None] + t).flatten()
+        which = (begun[:, None] + (rand[1] * histories).long()[:, None] * frames[:, None] + t).flatten()
+        sides = torch.arange(config.crop, device=self.device)
+        top, left = (((side - config.crop + 1) * r).long() for side, r in zip(TILE, rand[2:4], strict=True))
+        rows, columns = ((start[:, None] + sides).repeat_interleave(FRAMES, 0) for start in (top, left))
+        place = (when[:, None, None], slice(None), rows[:, :, None], columns[:, None, :])
+        # Pixels come first: channels-last images.
+        fixed, history = self.fixed[place], self.history[(which[:, None, None], *place[1:])]
+        # One turn and flip for the whole batch.
+        turns, flip = random.randrange(4), [1] * random.randrange(2)
+        fixed, history = (
+            images.rot90(turns, (1, 2)).flip(flip).permute(0, 3, 1, 2).float() for images in (fixed, history)
+        )
+        return *augmented(fixed, history, rand[4:], config), moving
+
+
+def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
+    """Frames from their channels, and the reference."""
+    current, albedo, normal, reference = fixed.split(list(CHANNELS.values()), 1)
+    frame = Frame(color=history[:, :3], current=current, length=history[:, 3:], albedo=albedo, normal=normal)
+    return frame, reference
+
+
+def each_frame(values: Tensor) -> Tensor:
+    """One value for each frame from one for each clip: ``(B T, 1, 1, 1)``."""
+    return values.repeat_interleave(FRAMES, 0).reshape(-1, 1, 1, 1)
+
+
+def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Frame, Tensor]:
+    """Colors and axes permuted, light scaled, histories and features dropped, lamps."""
+    clips, device = len(fixed) // FRAMES, fixed.device
+    frame, reference = framed(fixed, history)
+    order, axes = (torch.rand(clips, 3, device=device).argsort(1).repeat_interleave(FRAMES, 0) for _ in range(2))
+
+    def permuted(image: Tensor, by: Tensor) -> Tensor:
+        return image.gather(1, by[:, :, None, None].expand_as(image))
+
+    current, color, albedo, reference = (
+        permuted(e, order) for e in (frame.current, frame.color, frame.albedo, reference)
+    )
+    signs = (torch.rand(clips, 3, device=device) > 0.5).float().mul(2).sub(1).repeat_interleave(FRAMES, 0)
+    normal = permuted(frame.normal, axes) * signs[:, :, None, None]
+    stops = config.exposure * (2 * rand[0] - 1)[:, None] + config.tint * (2 * torch.rand(clips, 3, device=device) - 1)
+    factor = torch.exp2(stops).repeat_interleave(FRAMES, 0)[:, :, None, None]
+    if config.key:
+        factor = factor * auto_exposure(reference[::FRAMES], config.key).repeat_interleave(FRAMES, 0)
+    current, color, reference = (image * factor for image in (current, color, reference))
+    young = each_frame(rand[1] < YOUNG)
+    color, length = torch.where(young, current, color), torch.where(young, 1, frame.length)
+    if config.lamps:
+        inside, radiance, grey = lamps(reference, rand, config)
+        albedo = torch.where(inside, grey, albedo)
+        light = demodulate(radiance, grey.expand_as(radiance))
+        color, current = (torch.where(inside, light, image) for image in (color, current))
+        reference = torch.where(inside, radiance, reference)
+    normal = normal * each_frame(rand[3] > BARE)
+    bare = each_frame(rand[3] < BARE / 2)
+    color, current = (torch.where(bare, remodulate(image, albedo), image) for image in (color, current))
+    albedo = torch.where(bare, 1, albedo)
+    given = {"color": color, "current": current, "length": length, "albedo": albedo, "normal": normal}
+    given = {name: image.contiguous(memory_format=torch.channels_last) for name, image in given.items()}
+    return Frame(**given), reference
+
+
+def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Where lamps are, their radiance and albedo."""
+    clips, side = len(reference) // FRAMES, torch.arange(config.crop, device=reference.device)
+    own = torch.rand(8, clips, device=reference.device)
+    sizes = 2 + own[:2] * (config.crop // 3)
+    starts = own[2:4] * (config.crop - sizes)
+    rows, columns = ((side >= s[:, None]) & (side < (s + n)[:, None]) for s, n in zip(starts, sizes, strict=True))
+    inside = (rows[:, :, None] & columns[:, None, :] & (rand[2] < config.lamps)[:, None, None])[:, None]
+    tint = 0.7 + 0.6 * torch.rand(clips, 3, 1, 1, device=reference.device)
+    mean = reference[::FRAMES].mean((1, 2, 3), keepdim=True)
+    radiance = mean * torch.pow(30.0, own[4]).reshape(-1, 1, 1, 1) * tint
+    grey = (own[5] * (own[6] > 0.5)).reshape(-1, 1, 1, 1)
+    return tuple(each.repeat_interleave(FRAMES, 0) for each in (inside, radiance, grey))
+
+
+def errors(image: Tensor, reference: Tensor, moving: Tensor, config: TrainConfig) -> Tensor:
+    """The logarithm of the error of each clip."""
+    image, reference = (each.unflatten(0, (-1, FRAMES)) for each in (image, reference))
+    spatial = smape_linear(image, reference).mean(1)
+    total = spatial + config.display_weight * display_error(image, reference).mean(1)
+    total = total + config.temporal_weight * moving * temporal_smape_linear(image, reference)
+    return torch.log(total + RELATIVE)
+
+
+@torch.no_grad()
+def validated(network: nn.Module, tiles: Tiles) -> dict[str, Any]:
+    """Geometric means of SMAPE over takes of several frames, and over stills, and the mean PSNR of all."""
+    found: dict[str, list[tuple[float, float, int]]] = {}
+    network.eval()
+    for take in tiles.takes:
+        frame, reference = tiles.frames(take)
+        scale = oidn_exposure(reference[-1:])
+        image, reference = network(frame)[0].image * scale, reference * scale
+        errors = smape_linear(image, reference).mean().item(), psnr_srgb(image, reference).mean().item()
+        found.setdefault(take["take"], []).append((*errors, take["frames"]))
+    network.train()
+    means = {name: [sum(column) / len(rows) for column in zip(*rows, strict=True)] for name, rows in found.items()}
+    row: dict[str, Any] = {"psnr": sum(psnr for _, psnr, _ in means.values()) / len(means)}
+    for name, kind in (("moving", True), ("stills", False)):
+        logs = [math.log(smape) for smape, _, frames in means.values() if (frames > 1) == kind]
+        row[name] = math.exp(sum(logs) / max(len(logs), 1))
+    return {name: round(value, 5) for name, value in row.items()} | {
+        "takes": {name: round(smape, 5) for name, (smape, *_) in means.items()}
+    }
+
+
+@dataclass
+class Run:
+    """A network in training, and its average.
+
+    Args:
+        config: of the recipe.
+        device: that trains.
+    """
+
+    config: TrainConfig
+    device: torch.device
+
+    def __post_init__(self) -> None:
+        config = self.config
+        torch.manual_seed(config.seed)
+        random.seed(config.seed)
+        self.network: Any = create_model(config.model, **config.model_settings).train()
+        if config.start_from:
+            method = parse_method(config.start_from)
+            start_with(self.network, method.model, **method.settings)
+        self.network.to(self.device, memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
+        self.rest, self.averaged = split(self.network)[1], split(self.average)[1]
+        self.steps = 0
+
+    def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
+        """Make a step at a part of the time."""
+        config = self.config
+        rate = min(1.0, (self.steps + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
+        for group in self.optimizer.param_groups:
+            group["lr"] = config.learning_rate * rate
+        frame, reference, moving = tiles.draw(config, clips)
+        with torch.autocast(self.device.type, torch.bfloat16):
+            image = self.rest(frame)[0].image
+        loss = errors(image.float(), reference, moving, config).mean()
+        self.optimizer.zero_grad()
+        loss.backward()
+        if config.gradient_norm:
+            nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
+        self.optimizer.step()
+        self.steps += 1
+        kept = min(config.ema, self.steps / (self.steps + 9))
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - kept)
+        return loss.detach()
+
+    def save(self, path: Path, about: dict[str, str]) -> None:
+        """Write the averaged weights."""
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(save_weights(self.average, self.config.model, self.config.model_settings, about))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
+    parser.add_argument("packed", type=Path, metavar="FOLDER")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--recipe", type=Path, required=True, metavar="FILE.toml")
     parser.add_argument("--run", default="", metavar="NAME", help="of the recipe; not needed where it has only one")
-    parser.add_argument("--minutes", type=float, default=8.0, help="from the start of this script")
-    parser.add_argument("--validation", nargs="*", type=Path, default=[], metavar="TAKES")
-    parser.add_argument("--initial-weights", type=Path, metavar="FILE")
+    parser.add_argument("--seconds", type=float, default=300.0, help="from the start of this script")
+    parser.add_argument("--clips", type=int, default=32, help="in a step, instead of the recipe's batch")
+    parser.add_argument("--validation", type=Path, metavar="FOLDER")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     options = parser.parse_args()
 
-    start = time.monotonic()
+    begun, device = time.monotonic(), torch.device(options.device)
+    torch.backends.cudnn.benchmark = True
     recipe = Recipe.read(options.recipe, options_of("generate"))
-    (run,) = recipe.chosen([options.run] if options.run else [recipe.runs[0].name])
-    cache, plan = options.out / "cache", options.out / "plan.json"
-    if not plan.exists():
-        seconds = pace(run.config, options.takes, options.out / "pace", cache, options.device)
-        left = 60 * options.minutes * RESERVE - (time.monotonic() - start)
-        write_json(plan, {"seconds a step": seconds, "steps": max(1, int(left / seconds))})
-    config = replace(run.config, steps=json.loads(plan.read_text())["steps"])
-    print(f"{config.steps} steps", flush=True)
-    weights = train(
-        config,
-        options.takes,
-        options.out / "run",
-        validation=options.validation,
-        cache=cache,
-        initial_weights=options.initial_weights,
-        accelerator=options.device,
-        credits=recipe.credits,
-        recipe=run.sha256,
-        report=lambda progress: print(f"step {progress.step}, loss {progress.loss:.4f}", flush=True),
-    )
+    (chosen,) = recipe.chosen([options.run] if options.run else [recipe.runs[0].name])
+    config = replace(chosen.config, batch=options.clips, frames=FRAMES)
+    run, tiles = Run(config, device), Tiles(options.packed, device)
+    watched = Tiles(options.validation, device) if options.validation else None
+    options.out.mkdir(parents=True, exist_ok=True)
+    weights, log = options.out / f"{config.model}.safetensors", list[str]()
+    next_look, losses = 0.0, list[Tensor]()
+    while True:
+        passed = time.monotonic() - begun
+        over = passed >= options.seconds
+        if over or passed >= next_look:
+            tiles.update()
+            row = {"step": run.steps, "seconds": round(passed, 1), "tiles": len(tiles.takes)}
+            row["loss"] = round(torch.stack(losses).mean().item(), 4) if losses else None
+            row |= validated(run.averaged, watched) if watched else {}
+            log.append(json.dumps(row))
+            write_text(options.out / "log.jsonl", "\n".join(log) + "\n")
+            print({name: value for name, value in row.items() if name != "takes"}, flush=True)
+            about = {"config": json.dumps(asdict(config)), "steps": str(run.steps), "commit": source_commit()}
+            about |= {"credits": recipe.credits, "recipe": chosen.sha256}
+            about["data"] = json.dumps(
+                {"takes": len({take["take"] for take in tiles.takes}), "credits": authors(tiles)}
+            )
+            run.save(weights, about)
+            losses.clear()
+            next_look = time.monotonic() - begun + LOOK
+        if over:
+            break
+        losses.append(run.step(tiles, options.clips, passed / options.seconds))
     print(weights)
+
+
+def authors(tiles: Tiles) -> list[str]:
+    """Authors and licences of the assets, from lines with a name and these in parentheses."""
+    return sorted({line.partition(" (")[2].rstrip(")") for line in tiles.credits})
 
 
 if __name__ == "__main__":

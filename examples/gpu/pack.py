@@ -1,0 +1,104 @@
+"""Pack takes for training on a GPU: small parts with the frames that have references, as the network sees them.
+
+    python examples/gpu/pack.py TAKES... -o FOLDER --model wild
+
+Each take has passed the wrappers in front of the network: the radiance of its last frames is accumulated, once with the
+whole history and once with a shorter one. Values keep six bits of mantissa, so that a part has some fifty takes in 60
+MB. A part that exists is not written again.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcdenoise.data.files import atomic_path
+from mcdenoise.data.shards import Shard
+from mcdenoise.errors import InputError
+from mcdenoise.models import create_model
+from mcdenoise.train.front import Front, split
+from mcdenoise.train.packed import _read, open_packed
+
+FIXED = ("current", "albedo", "normal", "reference")
+HISTORY = ("color", "length")
+# The last bits of a half float that are dropped.
+DROPPED = 4
+# Height and width of a tile; all images are cut into tiles, so that they fit into one tensor.
+TILE = (128, 192)
+
+
+def rounded(values: NDArray[np.float16]) -> NDArray[np.uint16]:
+    """The bits of half floats, to the nearest with fewer bits of mantissa."""
+    bits = np.clip(values, -6e4, 6e4).view(np.uint16)
+    return ((bits + (1 << DROPPED >> 1)) >> DROPPED << DROPPED).astype(np.uint16)
+
+
+def planes(name: str, arrays: list[NDArray[np.float16]]) -> dict[str, NDArray[np.uint8]]:
+    """The two bytes of half floats apart, which compresses better."""
+    both = rounded(np.concatenate(arrays)).astype("<u2")
+    both = both.view(np.uint8).reshape(*both.shape, 2)
+    return {f"{name}.{byte}": np.ascontiguousarray(both[..., byte]) for byte in (0, 1)}
+
+
+def seen(shard: Shard, front: Front) -> Iterator[dict[str, NDArray[np.float16]]]:
+    """The frames with references of a take, with each history."""
+    first, features = len(shard) - shard.references, frozenset({"albedo", "normal"})
+    front = front.of(frozenset(shard.shapes))
+    for start in (0, 1 + int(shard.digest, 16) % first) if first else (0,):
+        yield _read(shard, front, features, start, first)
+
+
+def tiles(size: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
+    """The places of the tiles of an image; what is left over at its end is dropped."""
+    for top in range(0, size[0] - TILE[0] + 1, TILE[0]):
+        for left in range(0, size[1] - TILE[1] + 1, TILE[1]):
+            yield slice(top, top + TILE[0]), slice(left, left + TILE[1])
+
+
+def written(shards: list[Shard], front: Front, path: Path) -> None:
+    """Write a part."""
+    fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
+    for shard in shards:
+        found = list(seen(shard, front))
+        about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(found)}
+        for rows, columns in tiles(shard.size):
+            index.append(about)
+            fixed.append(np.concatenate([found[0][name][..., rows, columns] for name in FIXED], 1, dtype=np.float16))
+            history += [np.concatenate([e[name][..., rows, columns] for name in HISTORY], 1) for e in found]
+    text = np.frombuffer(json.dumps({"index": index, "credits": credits_of(shards)}).encode(), np.uint8)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, about=text, **planes("fixed", fixed), **planes("history", history))
+    print(f"{path}: {len(shards)} takes, {path.stat().st_size / 1e6:.1f} MB", flush=True)
+
+
+def credits_of(shards: list[Shard]) -> list[str]:
+    """Whom the assets of the takes are owed to."""
+    return sorted({str(line) for shard in shards for line in shard.header.get("credits", [])})
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--model", default="wild", help="whose wrappers the takes pass")
+    parser.add_argument("--size", type=int, default=45, help="takes in a part")
+    options = parser.parse_args()
+    front, _ = split(create_model(options.model))
+    options.out.mkdir(parents=True, exist_ok=True)
+    shards = open_packed(options.takes)
+    for first in range(0, len(shards), options.size):
+        path = options.out / f"part-{first // options.size:02}.npz"
+        if not path.exists():
+            written(shards[first : first + options.size], front, path)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
