@@ -313,7 +313,7 @@ def test_every_part_of_the_first_run_on_a_gpu_runs_on_a_processor(tmp_path: Path
     pytest.importorskip("mitsuba", reason="one part renders with Mitsuba")
     run("gpu/run_all.py", "-o", tmp_path, "--device", "cpu", "--quick")
     ends = json.loads((tmp_path / "summary.json").read_text())
-    assert {each["part"] for each in ends} == {"about", "ops", "models", "training", "mitsuba_loop"}
+    assert {each["part"] for each in ends} == {"about", "ops", "models", "peer", "training", "mitsuba_loop"}
     rows = [row for each in ends for row in json.loads((tmp_path / f"{each['part']}.json").read_text())]
     assert not [row for row in rows if "failed" in row]
     assert all(max(row["differences"]) < 1e-6 for row in rows if "differences" in row)

@@ -2,42 +2,28 @@
 
     python examples/gpu/models.py -o models.json
 
-Whole frames are steps of the model in a stream, in every precision that the device has; in float16 and bfloat16 also
-as a CUDA graph, and for the first models compiled by torch. "stream" is what a user of Denoiser gets, frame by frame,
-with the memory that torch holds after the tenth and after the last frame.
+Whole frames are steps of the model in a stream, and the same as a CUDA graph, in every precision that the device has;
+the first model is also compiled by torch. "stream" is what a user of Denoiser gets, frame by frame, with the memory
+that torch holds after the tenth and after the last frame.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import torch
-from part import Part, difference, shot
+from part import SIZES, Part, difference, shot
 from torch.utils import _pytree as pytree
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.errors import InputError
-from mcdenoise.models import DEFAULT, list_models
+from mcdenoise.models import DEFAULT, find_model, list_models
 
 # In this order, the most important first; then all others.
-FIRST = (DEFAULT, "oidn_tuned", "cascaded_v2_small", "cascaded", "svgf")
-COMPILED = FIRST[:3]
-SIZES = ((1280, 720), (1920, 1080))
+FIRST = (DEFAULT, "oidn_tuned", "oidn_tuned_small", "cascaded_v2_small", "cascaded", "svgf")
 AGREEING = (320, 180)
 STREAMED = 100
-PRECISIONS = {"float32": None, "bfloat16": torch.bfloat16, "float16": torch.float16}
-
-
-def available(part: Part) -> Iterator[str]:
-    """The models that can be made here, the most important first."""
-    names = dict.fromkeys((*FIRST, *list_models()))
-    for name in list(names)[:2] if part.quick else names:
-        try:
-            Denoiser(name)
-        except InputError:
-            continue
-        yield name
+PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": None}
 
 
 @contextmanager
@@ -147,25 +133,46 @@ def stream(part: Part, name: str, size: tuple[int, int]) -> dict[str, object]:
             memory.append(round(torch.cuda.memory_allocated() / 1e6, 1))
 
     found = part.milliseconds(one, rounds=count - 3)
-    return {**found, "MB after 10 and all frames": memory}
+    return {**found, "precision": denoiser.precision, "MB after 10 and all frames": memory}
 
 
 def main() -> None:
     part = Part.begin(__doc__)
+    # Those of other libraries, which may not run on the device.
+    others = [name for name in list_models() if find_model(name).kind != "peer" and name not in FIRST]
+    names, others, sizes = (FIRST[:2], [], ((64, 48),)) if part.quick else (FIRST, others, SIZES)
+    graphs = part.device.type == "cuda"
+
+    def frames(name: str, form: str) -> None:
+        torch.backends.cudnn.benchmark = True
+        for precision in PRECISIONS:
+            for size in sizes:
+                where = f"{name}, {size[0]}x{size[1]}, {precision}: {form}"
+                part.attempt(where, partial(times, part, name, size, precision, form))
+
+    def agreements(names: Sequence[str]) -> None:
+        torch.backends.cudnn.benchmark = False
+        for name in names:
+            part.attempt(f"{name}: agreement", partial(agreement, part, name))
+
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    names, sizes = list(available(part)), ((64, 48),) if part.quick else SIZES
-    for name in names:
-        part.attempt(f"{name}: agreement", partial(agreement, part, name))
+    for form in ("step", "graph") if graphs else ("step",):
+        frames(DEFAULT, form)
+    agreements(names)
     torch.backends.cudnn.benchmark = True
     for name in names:
         for size in sizes:
-            where = f"{name}, {size[0]}x{size[1]}"
-            part.attempt(f"{where}: stream", partial(stream, part, name, size))
-            for precision in PRECISIONS:
-                forms = ("step", "graph", "compiled") if name in COMPILED and precision != "float32" else ("step",)
-                for form in forms if part.device.type == "cuda" else ("step",):
-                    measure = partial(times, part, name, size, precision, form)
-                    part.attempt(f"{where}, {precision}: {form}", measure)
+            part.attempt(f"{name}, {size[0]}x{size[1]}: stream", partial(stream, part, name, size))
+    for name in names[1:]:
+        for form in ("step", "graph") if graphs else ("step",):
+            frames(name, form)
+    if graphs:
+        for precision in ("float16", "float32"):
+            where = f"{DEFAULT}, {sizes[0][0]}x{sizes[0][1]}, {precision}: compiled"
+            part.attempt(where, partial(times, part, DEFAULT, sizes[0], precision, "compiled"))
+    agreements(others)
+    for name in others:
+        frames(name, "step")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -16,6 +17,8 @@ from mcdenoise.benchmark.machine import check_device
 from mcdenoise.data.files import write_json
 from mcdenoise.models._stopwatch import Stopwatch
 
+# Width and height of whole frames.
+SIZES = ((1280, 720), (1920, 1080))
 _WARM_UP = 3
 
 
@@ -55,6 +58,11 @@ class Part:
         """Whether the time is up."""
         return time.monotonic() > self.end
 
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return max(self.end - time.monotonic(), 0.0)
+
     def add(self, **row: object) -> None:
         """Add a row to the file."""
         self.rows.append(row)
@@ -65,6 +73,10 @@ class Part:
         """Add the row that ``measure`` returns, or the error that it raises; the parts go on."""
         try:
             found = {"failed": "not reached in time"} if self.is_over else measure()
+            if self.device.type == "cuda":
+                # What fails on the device fails in this row, and later ones have its memory.
+                torch.cuda.synchronize()
+                torch.cuda.empty_cache()
         except Exception as error:  # whatever a device or a compiler raises
             found = {"failed": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"}
         self.add(name=name, **found)
@@ -82,8 +94,9 @@ class Part:
         return {"ms": round(median, 4), "quartiles": [round(low, 4), round(high, 4)]}
 
 
+@cache
 def shot(count: int, width: int, height: int) -> list[Frame]:
-    """Noisy frames of a textured, curved wall that moves past the camera by a fraction of a pixel."""
+    """Noisy frames of a textured, curved wall that moves past the camera by a fraction of a pixel; for all rows."""
     g = torch.Generator().manual_seed(0)
     y, x = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
     frames = []

@@ -1,4 +1,4 @@
-"""Measure in six minutes what a GPU does with the operators, the models and a training step: one JSON file a part.
+"""Measure in four minutes what a GPU does with the models, the operators and a training step: one JSON file a part.
 
     python examples/gpu/run_all.py -o OUT
     python examples/gpu/run_all.py -o OUT --device cpu --quick
@@ -18,7 +18,7 @@ from mcdenoise.data.files import write_json
 from mcdenoise.errors import InputError
 
 # Seconds of each part, of which starting Python and torch takes some.
-PARTS = {"about": 20, "ops": 120, "models": 120, "training": 60, "mitsuba_loop": 40}
+PARTS = {"about": 15, "models": 80, "peer": 12, "mitsuba_loop": 20, "training": 22, "ops": 70}
 
 
 def run(name: str, out: Path, options: list[str], seconds: float) -> dict[str, object]:
