@@ -17,7 +17,7 @@ from pathlib import Path
 from mcdenoise.data.files import write_json
 from mcdenoise.errors import InputError
 
-# Seconds of each part, of which starting Python and torch takes some.
+# Seconds of each part once Python and torch have started; rows that have begun then still end.
 PARTS = {"about": 15, "models": 80, "peer": 12, "mitsuba_loop": 20, "training": 22, "ops": 70}
 
 
@@ -29,7 +29,7 @@ def run(name: str, out: Path, options: list[str], seconds: float) -> dict[str, o
     with log.open("w") as file:
         try:
             # Parts end by themselves before their limit; this is for those that hang.
-            status = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, timeout=seconds + 10).returncode
+            status = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, timeout=seconds + 20).returncode
         except subprocess.TimeoutExpired:
             status = -1
     last = log.read_text(errors="replace").strip().rpartition("\n")[2]
