@@ -22,7 +22,7 @@ Size = tuple[int, int, int, int]
 Builder = Callable[..., Inputs]
 _SETTING = inspect.Parameter.KEYWORD_ONLY
 
-# Tiny, because gradients are checked one element at a time, and odd, because errors at borders show there.
+# Tiny, because errors are bounded by perturbing one element at a time, and odd, because errors at borders show there.
 ORDINARY: dict[str, Size] = {
     "RGB, 3x5": (1, 3, 3, 5),
     "batch of 2": (2, 1, 2, 3),

@@ -17,11 +17,11 @@ def gradcheck(
     order: Literal[1, 2] = 2,
     json: Json = None,
 ) -> int:
-    """Check first and second derivatives of operators against finite differences in float64, element by element.
+    """Check first and second derivatives of operators against finite differences in float64.
 
-    A function of your own takes floating-point tensors. Its file defines the example inputs, a small tuple of tensors
-    or several tuples by name, as `function.example_inputs`, or as `inputs()` for all functions in the file; by default
-    every argument is an image of 6 by 5 pixels.
+    A function of your own takes floating-point tensors, and is checked element by element. Its file defines the example
+    inputs, a small tuple of tensors or several tuples by name, as `function.example_inputs`, or as `inputs()` for all
+    functions in the file; by default every argument is an image of 6 by 5 pixels.
 
     Args:
         ops: names of operators, or functions of your own, path/to/file.py:function or package.module:function, with

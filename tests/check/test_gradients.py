@@ -45,14 +45,9 @@ class _Leaking(torch.autograd.Function):
         return gradient + gradient.mean(0, keepdim=True)
 
 
-def result_of(function: object, order: int = 2, width: int = 2) -> tuple[bool, str]:
-    """An op with a case of this width, and a smaller case, which torch's own check covers as well."""
-    cases = [
-        Case(f"{size} pixels", "ordinary", lambda g, size=size: {"image": uniform(g, 1, 1, 2, size)}, ("image",))
-        for size in (2, width)
-    ]
-    op = Op(function, tuple(cases))  # type: ignore[arg-type]
-    result = check_case(op, cases[1], order)
+def result_of(function: object, order: int = 2, images: int = 1) -> tuple[bool, str]:
+    case = Case("pixels", "ordinary", lambda g: {"image": uniform(g, images, 1, 2, 3)}, ("image",))
+    result = check_case(Op(function, (case,)), case, order)  # type: ignore[arg-type]
     return result.passed, result.message
 
 
@@ -73,17 +68,16 @@ def test_a_wrong_derivative_fails() -> None:
 
 
 def test_a_wrong_second_derivative_fails() -> None:
-    for width in (2, 200):
-        assert result_of(_Forgetful.apply, order=1, width=width) == (True, "")
-        passed, message = result_of(_Forgetful.apply, width=width)
-        assert not passed
-        assert "Jacobian mismatch" in message
+    assert result_of(_Forgetful.apply, order=1) == (True, "")
+    passed, message = result_of(_Forgetful.apply)
+    assert not passed
+    assert "second derivatives: Jacobian mismatch" in message
 
 
 def test_a_derivative_that_leaks_to_another_image_fails() -> None:
     image = torch.rand(1, 1, 2, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(_Leaking.apply, image)
-    passed, message = result_of(_Leaking.apply, order=1, width=3)
+    passed, message = result_of(_Leaking.apply, order=1, images=2)
     assert not passed
     assert "Jacobian mismatch for output 0 with respect to input 0: element 0 of the output in element 0" in message
 
