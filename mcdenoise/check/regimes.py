@@ -81,26 +81,20 @@ class Row:
     given: Mapping[str, Any]
 
 
-def ordinary(
-    name: str, size: Size = (1, 1, 2, 3), /, image: Draw = normal, smooth: tuple[str, ...] | None = None, **given: Any
-) -> Row:
-    """A row whose derivatives are checked."""
-    return Row(name, "ordinary", size, image, smooth, given)
+def _rows(kind: Kind, size: Size, image: Draw, smooth: tuple[str, ...] | None) -> Callable[..., Row]:
+    def row(
+        name: str, size: Size = size, /, image: Draw = image, smooth: tuple[str, ...] | None = smooth, **given: Any
+    ) -> Row:
+        return Row(name, kind, size, image, smooth, given)
+
+    return row
 
 
-def stiff(
-    name: str, size: Size = (1, 1, 2, 3), /, image: Draw = normal, smooth: tuple[str, ...] | None = None, **given: Any
-) -> Row:
-    """A row in which results change fast with the inputs; its derivatives are checked too."""
-    return Row(name, "stiff", size, image, smooth, given)
-
-
-def extreme(
-    name: str, size: Size = (1, 3, 2, 4), /, image: Draw = radiance, smooth: tuple[str, ...] = (), **given: Any
-) -> Row:
-    """A row at the limits of valid input, of which the step of finite differences, 1e-6, is too large or too small."""
-    return Row(name, "extreme", size, image, smooth, given)
-
+# A row whose derivatives are checked; one in which results change fast with the inputs; and one at the limits of valid
+# input, of which the step of finite differences, 1e-6, is too large or too small.
+ordinary = _rows("ordinary", (1, 1, 2, 3), normal, None)
+stiff = _rows("stiff", (1, 1, 2, 3), normal, None)
+extreme = _rows("extreme", (1, 3, 2, 4), radiance, ())
 
 FIREFLIES = stiff("fireflies", (1, 3, 2, 3), dim)
 

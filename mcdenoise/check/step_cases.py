@@ -6,7 +6,6 @@ Their formulas in float64 are in ``tests/oracles/steps.py``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,119 +13,103 @@ import torch
 from torch import Generator, Tensor
 
 from mcdenoise.check import _temporal
-from mcdenoise.check.case import Case, Inputs, Op, normal, uniform
+from mcdenoise.check.case import Case, Draw, Inputs, Op, between, normal, uniform
 from mcdenoise.ops._steps import history, network
 
+# Batch, height and width.
 Size = tuple[int, int, int]
-SIZES: tuple[tuple[str, Size], ...] = (
-    ("5x7", (1, 5, 7)),
-    ("batch of 2", (2, 3, 4)),
-    ("one row", (1, 1, 6)),
-    ("one pixel", (1, 1, 1)),
-)
+# An argument of a step, for images of a size.
+Argument = Callable[[Size, Generator], Any]
+SIZES: dict[str, Size] = {"5x7": (1, 5, 7), "batch of 2": (2, 3, 4), "one row": (1, 1, 6), "one pixel": (1, 1, 1)}
 
 
-def _cases(
-    tensors: Callable[[Size, Generator], Inputs], differentiable: tuple[str, ...], /, **settings: Any
-) -> tuple[Case, ...]:
-    return tuple(Case(name, "ordinary", partial(tensors, size), differentiable, dict(settings)) for name, size in SIZES)
+def _images(
+    channels: int, draw: Draw = between(0.1, 3.0), change: Callable[[Tensor], object] | None = None
+) -> Argument:
+    def drawn(size: Size, g: Generator) -> Tensor:
+        images = draw(g, size[0], channels, *size[1:])
+        if change is not None:
+            change(images)
+        return images
+
+    return drawn
 
 
-def _positive(size: Size, g: Generator, channels: int = 3) -> Tensor:
-    return uniform(g, size[0], channels, *size[1:], low=0.1, high=3.0)
+def _step(
+    function: Callable[..., Any], arguments: dict[str, Argument], smooth: str, extra: tuple[Case, ...] = (), **more: Any
+) -> Op:
+    """A step with a case of each size; between accumulation and convolutions frames are in float32 at least."""
+    cases = (
+        Case(name, "ordinary", partial(_drawn, arguments, size), tuple(smooth.split())) for name, size in SIZES.items()
+    )
+    return Op(function, (*cases, *extra), half_precision=False, **more)
+
+
+def _drawn(arguments: dict[str, Argument], size: Size, g: Generator) -> Inputs:
+    return {name: draw(size, g) for name, draw in arguments.items()}
 
 
 def _factor(size: Size, g: Generator) -> Tensor:
     return uniform(g, size[0], 1, 1, 1, low=0.5, high=2.0)
 
 
-def _depth(size: Size, g: Generator) -> Tensor:
-    depth = uniform(g, size[0], 1, *size[1:], low=1.0, high=20.0)
+def _coarse(size: Size, g: Generator) -> Tensor:
+    return normal(g, size[0], 3, (size[1] + 1) // 2, (size[2] + 1) // 2)
+
+
+def _far_corner(depth: Tensor) -> None:
     depth[..., 0, -1] = torch.inf
-    return depth
 
 
-def _buffers(size: Size, g: Generator) -> Inputs:
-    depth = _depth(size, g)
-    return {
-        "albedo": uniform(g, size[0], 3, *size[1:]),
-        "normal": normal(g, size[0], 3, *size[1:]),
-        "depth": depth,
-        "current": _positive(size, g),
-        "length": 1 + _positive(size, g, 1),
-        "exposure": _factor(size, g),
-        "scale": [_factor(size, g), _factor(size, g)],
-    }
-
-
-def _buffers_input(size: Size, g: Generator) -> Inputs:
-    return {"image": _positive(size, g), **_buffers(size, g)}
-
-
-def _half(size: Size) -> Size:
-    return size[0], (size[1] + 1) // 2, (size[2] + 1) // 2
-
-
-def _fusion(size: Size, g: Generator) -> Inputs:
-    return {
-        "fine": _positive(size, g),
-        "coarse": normal(g, size[0], 3, *_half(size)[1:]),
-        "weight": 0.3 * normal(g, 1, 6, 3, 3),
-        "bias": normal(g, 1),
-    }
-
-
-def _entering(size: Size, g: Generator) -> Inputs:
-    color = _positive(size, g)
+def _firefly(color: Tensor) -> None:
     color[..., 0, 0] = 400
-    return {"color": color, "albedo": uniform(g, size[0], 3, *size[1:], low=0.1, high=0.9)}
 
 
-def _root(size: Size, g: Generator) -> Inputs:
-    root = _positive(size, g, 1)
-    root[..., : size[1] // 2 + 1, : size[2] // 2 + 1] = 6
-    return {"root": root}
+def _bright_corner(root: Tensor) -> None:
+    root[..., : root.shape[-2] // 2 + 1, : root.shape[-1] // 2 + 1] = 6
 
 
-def _history(channels: tuple[int, int], size: Size, g: Generator) -> Inputs:
-    entering, previous = _positive((size[0], *size[1:]), g, channels[0]), _positive(size, g, channels[1])
-    return {
-        "entering": entering,
-        "previous": previous,
-        "previous_length": uniform(g, size[0], 1, *size[1:], low=1.0, high=6.0),
-        # Stay away from whole pixels, where the derivative jumps.
-        "motion": uniform(g, size[0], 2, *size[1:], low=0.1, high=0.4),
-    }
+_BUFFERS: dict[str, Argument] = {
+    "image": _images(3),
+    "albedo": _images(3, uniform),
+    "normal": _images(3, normal),
+    "depth": _images(1, between(1.0, 20.0), _far_corner),
+    "current": _images(3),
+    "length": _images(1, between(1.1, 4.0)),
+    "exposure": _factor,
+    "scale": lambda size, g: [_factor(size, g), _factor(size, g)],
+}
+_FUSION: dict[str, Argument] = {
+    "fine": _images(3),
+    "coarse": _coarse,
+    "weight": lambda size, g: 0.3 * normal(g, 1, 6, 3, 3),
+    "bias": lambda size, g: normal(g, 1),
+}
+_PARTS = tuple(_FUSION)
+_HISTORY: dict[str, Argument] = {
+    "entering": _images(3),
+    "previous": _images(3),
+    "previous_length": _images(1, between(1.0, 6.0)),
+    # Stay away from whole pixels, where the derivative jumps.
+    "motion": _images(2, between(0.1, 0.4)),
+}
 
-
-_BUFFERS = ("albedo", "normal", "current", "length", "exposure", "scale")
-
-# Between accumulation and a network's convolutions frames are in float32, so steps need not support half precision.
-STEPS: tuple[Op, ...] = tuple(
-    replace(step, half_precision=False)
-    for step in (
-        Op(network.buffers_input, _cases(_buffers_input, ("image", *_BUFFERS))),
-        # Its weights have no batch axis.
-        Op(
-            network.gated_fusion,
-            (
-                *_cases(_fusion, ("fine", "coarse", "weight", "bias")),
-                Case(
-                    "logarithms",
-                    "ordinary",
-                    partial(_fusion, (1, 3, 5)),
-                    ("fine", "coarse", "weight", "bias"),
-                    {"logarithms": True},
-                ),
-            ),
-            batched=False,
-        ),
-        Op(history.incoming, _cases(_entering, ()), least_dtype=torch.float32),
-        Op(history.lights, _cases(_root, ())),
-        Op(
-            history.blend,
-            _cases(partial(_history, (3, 3)), ("entering", "previous", "motion")),
-            rounds=_temporal.motion_rounds,
-        ),
-    )
+STEPS: tuple[Op, ...] = (
+    _step(network.buffers_input, _BUFFERS, "image albedo normal current length exposure scale"),
+    # Its weights have no batch axis.
+    _step(
+        network.gated_fusion,
+        _FUSION,
+        "fine coarse weight bias",
+        (Case("logarithms", "ordinary", partial(_drawn, _FUSION, (1, 3, 5)), _PARTS, {"logarithms": True}),),
+        batched=False,
+    ),
+    _step(
+        history.incoming,
+        {"color": _images(3, change=_firefly), "albedo": _images(3, between(0.1, 0.9))},
+        "",
+        least_dtype=torch.float32,
+    ),
+    _step(history.lights, {"root": _images(1, change=_bright_corner)}, ""),
+    _step(history.blend, _HISTORY, "entering previous motion", rounds=_temporal.motion_rounds),
 )

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import tyro
 
-from mcdenoise.check.stability import (
-    FRAMES,
-    VALID_SHOT,
-    Check,
-    LongRun,
-    Summary,
-    as_json,
-    groups,
-    parse_dtypes,
-    summarize,
-)
+from mcdenoise.check.stability import FRAMES, LONG_RUNS, VALID_SHOT, Check, as_json, groups, parse_dtypes
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import print_rows, progress_bar, write_json
 from mcdenoise.errors import InputError
@@ -42,47 +34,57 @@ def stability(
             none if operators are named.
         dtypes: precisions to check.
         frames: number of frames of the long runs.
-        json: write every check to this file too, and the errors of the long runs over time.
+        json: write every check to this file too.
     """
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
     chosen = groups(ops or None, models or None, parse_dtypes(dtypes), frames)
     checks: list[Check] = []
-    runs: list[LongRun] = []
     with progress_bar() as progress:
         for group in progress.track(chosen, description="stability"):
-            for result in group.run():
-                checks.append(result) if isinstance(result, Check) else runs.append(result)
-    _print_checks(checks)
+            checks += group.run()
+    runs = [check for check in checks if check.subject == LONG_RUNS]
+    _print_checks([check for check in checks if check.subject != LONG_RUNS])
     _print_shots(checks)
-    _print_long_runs(runs)
+    print_rows(
+        [
+            {
+                "long run": run.case,
+                "dtype": run.dtype,
+                "error": f"{run.error:.2g} of {run.allowed:.2g}" if run.allowed else "-",
+                "result": "ok" if run.passed else f"FAILED: {run.message}",
+            }
+            for run in runs
+        ]
+    )
     for note in filter(None, (group.note for group in chosen)):
         print(note)
-    write_json(json, as_json(checks, runs))
-    failed = sum(not check.passed for check in checks) + sum(not run.passed for run in runs)
-    print(f"{len(checks) + len(runs)} checks, {failed} failed")
+    write_json(json, as_json(checks))
+    failed = sum(not check.passed for check in checks)
+    print(f"{len(checks)} checks, {failed} failed")
     return 1 if failed else 0
 
 
 def _print_checks(checks: list[Check]) -> None:
     """Print a row for each subject, dtype and backend: the error that is closest to its bound, and that bound."""
-    found: dict[tuple[str, str, str], dict[str, Summary]] = {}
-    for summary in summarize(checks):
-        found.setdefault((summary.subject, summary.dtype, summary.backend), {})[summary.what] = summary
+    found: dict[tuple[str, str, str], list[Check]] = {}
+    for check in checks:
+        found.setdefault((check.subject, check.dtype, check.backend), []).append(check)
     rows = []
-    for key, summaries in found.items():
+    for key, own in found.items():
         row = dict(zip(("subject", "dtype", "backend"), key, strict=True))
-        row["checks"] = str(sum(summary.checks for summary in summaries.values()))
-        row["condition"] = f"{max(summary.condition for summary in summaries.values()):.1g}"
+        row |= {"checks": str(len(own)), "condition": f"{max(check.condition for check in own):.1g}"}
+        failed = [check for check in own if not check.passed]
         for what in ("forward", "gradient"):
-            worst = summaries[what].worst if what in summaries else None
+            worst = max((each for each in own if each.what == what), key=attrgetter("closeness"), default=None)
             row[what] = f"{worst.error:.2g} of {worst.allowed:.2g}" if worst and worst.allowed else "-"
-        row["holds"] = ", ".join(what for what, summary in summaries.items() if not summary.failed)
+        kinds = dict.fromkeys(check.what for check in own)
+        row["holds"] = ", ".join(what for what in kinds if what not in {check.what for check in failed})
         row["result"] = "ok"
-        if failed := [check for summary in summaries.values() for check in summary.failed]:
+        if failed:
             row["result"] = f"{len(failed)} FAILED: {failed[0].what}, {failed[0].case}: {failed[0].message}"
-        elif list(summaries) == ["runs"]:
-            row |= {"holds": "-", "result": f"not run: {summaries['runs'].worst.message}"}
+        elif list(kinds) == ["runs"]:
+            row |= {"holds": "-", "result": f"not run: {own[0].message}"}
         rows.append(row)
     print_rows(rows)
 
@@ -99,22 +101,3 @@ def _print_shots(checks: list[Check]) -> None:
         result = f"FAILED: {failed[0]}" if failed else "ok"
         rows.append({"shot": case, "checks": str(len(found)), "every image is finite and not negative": result})
     print_rows(rows)
-
-
-def _print_long_runs(runs: list[LongRun]) -> None:
-    print_rows(
-        [
-            {
-                "long run": run.name,
-                "dtype": run.dtype,
-                "error after frames": ", ".join(
-                    f"{number}: {error:.1g}" for number, error in zip(run.frames, run.errors, strict=True)
-                )
-                or "-",
-                "at most": f"{run.allowed:.2g}" if run.allowed else "-",
-                "ghost": "-" if run.ghost is None else f"{run.ghost} frames",
-                "result": "ok" if run.passed else run.message,
-            }
-            for run in runs
-        ]
-    )

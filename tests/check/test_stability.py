@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mcdenoise.check.cases import OPS, Op
 from mcdenoise.check.stability import _models, check_case, check_denoiser, check_model, check_op, long_runs
-from mcdenoise.check.stability import _ops as op_checks
 from mcdenoise.check.stability._trial import backends
 from mcdenoise.ops import _backend, _op, kernel_conv
 from mcdenoise.ops._op import op, plain
@@ -99,13 +98,6 @@ def test_a_nan_gradient_fails() -> None:
     assert {"albedo 0"} <= found["gradient"]
 
 
-def test_splatting_that_is_not_the_transpose_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrong = like("kernel_splat", lambda image, kernel, **given: kernel_conv(image, kernel, **given))
-    others = tuple(op for op in OPS if op.name != "kernel_splat")
-    monkeypatch.setattr(op_checks, "OPS", (*others, wrong))
-    assert failures(BY_NAME["kernel_conv"]).keys() == {"adjoint"}
-
-
 @pytest.mark.parametrize("scale", [1 + 1e-5, 1 - 1e-5])
 def test_an_error_of_a_hundred_rounding_errors_fails(scale: float) -> None:
     def scaled(image: Tensor, albedo: Tensor) -> Tensor:
@@ -126,11 +118,10 @@ def test_backends_are_checked_and_unavailable_ones_are_reported(monkeypatch: pyt
     tried = like("downsample", two_forms)
     assert backends(tried) == ("torch", "numba")
     assert backends(BY_NAME["upsample"]) == (None,)
-    case = tried.cases[0]
-    assert all(check.passed for check in check_case(tried, case, torch.float32, "torch"))
-    assert not all(check.passed for check in check_case(tried, case, torch.float32, "numba"))
+    failed = {check.backend for check in check_case(tried, tried.cases[0], torch.float32) if not check.passed}
+    assert failed == {"numba"}
     monkeypatch.setattr(_backend, "_missing", lambda: "is not there")
-    (told,) = check_case(tried, case, torch.float32, "numba")
+    (told,) = [check for check in check_case(tried, tried.cases[0], torch.float32) if check.backend == "numba"]
     assert told.passed
     assert "is not there" in told.message
 
@@ -183,14 +174,13 @@ def test_a_users_model_is_checked(tmp_path: Path) -> None:
 
 
 def test_long_runs() -> None:
-    runs = {(run.name, run.dtype): run for run in long_runs(frames=300, moving_frames=60)}
+    runs = {(run.case, run.dtype): run for run in long_runs(frames=300, moving_frames=60)}
     assert not [run for run in runs.values() if not run.passed]
     still = runs["still", "bfloat16"]
-    assert still.frames == [1, 3, 10, 30, 100, 300]
     # Errors in half precision are not zero, and close enough to the bound to make it meaningful.
-    assert 0.01 * still.allowed < max(still.errors) < still.allowed < 0.05
-    assert runs["light off, without anti-lag", "float32"].ghost == 44
-    assert runs["light off, with anti-lag", "float32"].ghost == 1
+    assert 0.01 * still.allowed < still.error < still.allowed < 0.05
+    assert runs["light off, without anti-lag", "float32"].error == 44
+    assert runs["light off, with anti-lag", "float32"].error == 1
 
 
 def test_the_command(tmp_path: Path) -> None:
@@ -202,7 +192,6 @@ def test_the_command(tmp_path: Path) -> None:
     assert content["passed"]
     assert {check["subject"] for check in content["checks"]} == {"demodulate"}
     assert {check["dtype"] for check in content["checks"]} == {"float16"}
-    assert content["long_runs"] == []
 
 
 def test_the_command_has_a_row_for_each_unusual_shot(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import torch
 
 from mcdenoise.check.own import note_of
 from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
-from mcdenoise.check.stability._check import DTYPES, Check, Summary, parse_dtypes, summarize
+from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check, parse_dtypes
 from mcdenoise.check.stability._denoiser import VALID_SHOT, check_denoiser
-from mcdenoise.check.stability._long_runs import FRAMES, LongRun, long_runs
+from mcdenoise.check.stability._long_runs import FRAMES, long_runs
 from mcdenoise.check.stability._models import check_model
 from mcdenoise.check.stability._ops import check_case, check_op, check_stability
 from mcdenoise.errors import InputError
@@ -24,11 +24,10 @@ from mcdenoise.models import list_models
 __all__ = [
     "DTYPES",
     "FRAMES",
+    "LONG_RUNS",
     "VALID_SHOT",
     "Check",
     "Group",
-    "LongRun",
-    "Summary",
     "as_json",
     "check_case",
     "check_denoiser",
@@ -38,7 +37,6 @@ __all__ = [
     "groups",
     "long_runs",
     "parse_dtypes",
-    "summarize",
 ]
 
 
@@ -48,12 +46,12 @@ class Group:
 
     Args:
         name: of the op, the model or the denoiser that is checked.
-        run: runs the checks, or the long runs.
+        run: runs the checks.
         note: what is not checked, in one line; usually empty.
     """
 
     name: str
-    run: Callable[[], Iterable[Check | LongRun]]
+    run: Callable[[], Iterable[Check]]
     note: str = ""
 
 
@@ -84,7 +82,7 @@ def groups(
         *(Group(op.name, partial(_ops.check_op, op, dtypes), note_of(op)) for op in chosen_ops),
         *(Group(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
         *(Group(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
-        *([Group("long runs", partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
+        *([Group(LONG_RUNS, partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
     ]
 
 
@@ -102,16 +100,10 @@ def _available(names: Sequence[str] | None) -> list[str]:
     return found
 
 
-def as_json(checks: Sequence[Check], runs: Sequence[LongRun]) -> dict[str, Any]:
+def as_json(checks: Sequence[Check]) -> dict[str, Any]:
     """All results as JSON values; infinite values and NaN become ``null``."""
-    return {
-        "passed": all(check.passed for check in checks) and all(run.passed for run in runs),
-        "checks": [{name: _number(value) for name, value in asdict(check).items()} for check in checks],
-        "long_runs": [
-            {**asdict(run), "errors": [_number(error) for error in run.errors], "allowed": _number(run.allowed)}
-            for run in runs
-        ],
-    }
+    rows = [{name: _number(value) for name, value in asdict(check).items()} for check in checks]
+    return {"passed": all(check.passed for check in checks), "checks": rows}
 
 
 def _number(value: Any) -> Any:

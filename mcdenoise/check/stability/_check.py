@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ import torch
 from mcdenoise.errors import InputError
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
+LONG_RUNS = "long runs"
 
 
 @dataclass(frozen=True)
@@ -18,12 +19,13 @@ class Check:
     """Result of one check.
 
     Args:
-        subject: the op, the model or the denoiser.
+        subject: the op, the model, the denoiser, or :data:`LONG_RUNS`.
         case: name of the inputs.
         dtype: such as ``"float32"``.
         backend: backend of an op; ``""`` if it has only one.
-        what: the property that was checked, such as ``"forward"`` or ``"constant"``.
-        error: the error closest to its bound, in units of the dtype's epsilon times the condition number.
+        what: the property that was checked, such as ``"forward"`` or ``"exposure"``.
+        error: the error closest to its bound, in units of the dtype's epsilon times the condition number; of a long run
+            relative to the largest value, or the number of frames that a ghost lasts.
         allowed: its bound by error analysis, in the same units.
         condition: maximum condition number of the case: the factor by which it magnifies relative input changes.
         passed: whether the property holds.
@@ -41,47 +43,24 @@ class Check:
     passed: bool
     message: str = ""
 
-
-@dataclass(frozen=True)
-class Summary:
-    """The checks of one kind of one subject in one dtype, worst first.
-
-    Args:
-        subject: see :class:`Check`.
-        dtype: see :class:`Check`.
-        backend: see :class:`Check`.
-        what: see :class:`Check`.
-        checks: number of checks.
-        worst: the check that is closest to its bound, or furthest beyond it.
-        condition: maximum condition number of all.
-        failed: the failed checks.
-    """
-
-    subject: str
-    dtype: str
-    backend: str
-    what: str
-    checks: int
-    worst: Check
-    condition: float
-    failed: tuple[Check, ...]
+    @property
+    def closeness(self) -> float:
+        """The error as a fraction of its bound, infinite for NaN."""
+        fraction = self.error / self.allowed if self.allowed else 0.0
+        return math.inf if math.isnan(fraction) else fraction
 
 
-def summarize(checks: Iterable[Check]) -> list[Summary]:
-    """Group checks by subject, dtype, backend and property, in order of first appearance."""
-    groups: dict[tuple[str, str, str, str], list[Check]] = {}
-    for check in checks:
-        groups.setdefault((check.subject, check.dtype, check.backend, check.what), []).append(check)
-    return [
-        Summary(
-            *key,
-            checks=len(group),
-            worst=max(group, key=lambda check: (not check.passed, _fraction_of_bound(check))),
-            condition=max(check.condition for check in group),
-            failed=tuple(check for check in group if not check.passed),
-        )
-        for key, group in groups.items()
-    ]
+def bounded(
+    subject: str, case: str, dtype: torch.dtype, what: str, error: float, allowed: float, condition: float = 0.0
+) -> Check:
+    """A check that an error is at most what is allowed; NaN is not."""
+    message = "" if error <= allowed else f"error {error:.3g}, expected at most {allowed:.3g}"
+    return Check(subject, case, name_of(dtype), "", what, error, allowed, condition, not message, message)
+
+
+def held(subject: str, case: str, dtype: torch.dtype, what: str, message: str) -> Check:
+    """A check of a property, which holds if there is no message."""
+    return Check(subject, case, name_of(dtype), "", what, 0, 0, 0, not message, message)
 
 
 def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
@@ -100,8 +79,3 @@ def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
 def name_of(dtype: torch.dtype) -> str:
     """Name of a dtype, such as ``"float32"`` for ``torch.float32``."""
     return str(dtype).removeprefix("torch.")
-
-
-def _fraction_of_bound(check: Check) -> float:
-    fraction = check.error / check.allowed if check.allowed else 0.0
-    return math.inf if math.isnan(fraction) else fraction

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.check.stability._check import DTYPES, Check, name_of
-from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, ROUNDED, joined, relative_change
+from mcdenoise.check.stability._check import DTYPES, Check, bounded, held
+from mcdenoise.check.stability._models import ALLOWED, EXPOSURES, joined, relative_change
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -30,6 +30,8 @@ UNEVEN = "uneven radiance"
 _SIZE = (17, 23)
 _MIDDLE = (8, 11)
 _PATTERNS = 8
+# Rounding errors of an image that hardly depends on its inputs.
+_LEAST = 3
 _SOME = (..., slice(3, 9), slice(None))
 # NaN in these buffers is rejected; only in color is it repaired.
 _REFUSED = ("albedo", "normal", "depth", "position", "motion", "view_projection")
@@ -174,7 +176,7 @@ def _valid(denoiser: Denoiser, shots: Shots, dtype: torch.dtype) -> Iterator[Che
             if not torch.isfinite(image).all() or not (image >= 0).all():
                 messages[name] = messages[name] or f"frame {number}: NaN, infinite or negative pixels"
     for name, message in messages.items():
-        yield _found(name, dtype, VALID_SHOT, message)
+        yield held("Denoiser", name, dtype, VALID_SHOT, message)
 
 
 def _gradients(model: str, shots: Shots) -> Iterator[Check]:
@@ -196,7 +198,7 @@ def _gradients(model: str, shots: Shots) -> Iterator[Check]:
         found = torch.autograd.grad(image.sum(), leaves, allow_unused=True)
         for index, name in enumerate(batch):
             finite = all(bool(gradient[index].isfinite().all()) for gradient in found if gradient is not None)
-            yield _found(name, torch.float32, "gradient", "" if finite else "a gradient is NaN or infinite")
+            yield held("Denoiser", name, torch.float32, "gradient", "" if finite else "a gradient is NaN or infinite")
 
 
 def _contained(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
@@ -218,7 +220,7 @@ def _contained(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
             known.append((mended, expected))
         if not all(map(torch.equal, _images(denoiser, frames, invalid), expected)):
             message = message or "an invalid pixel changes its neighbours"
-        yield _found(f"one pixel of {value:g}", dtype, "contained", message)
+        yield held("Denoiser", f"one pixel of {value:g}", dtype, "contained", message)
 
 
 def _images(denoiser: Denoiser, frames: Sequence[Frame], colors: Sequence[Tensor]) -> list[Tensor]:
@@ -243,7 +245,7 @@ def _refused(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
             message = "" if name in str(error) and "\n" not in str(error) else f"not one clear line: {error}"
         if not message and not torch.equal(denoiser(frames[1]), expected):
             message = "the history was changed by a rejected frame"
-        yield _found(f"NaN in {name}", dtype, "refused", message)
+        yield held("Denoiser", f"NaN in {name}", dtype, "refused", message)
 
 
 def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
@@ -275,10 +277,8 @@ def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
             for output in outputs
             for name in {OIDN, OIDN_CLEAN} & output.stages.keys()
         )
-        allowed = ALLOWED * max(largest, ROUNDED) + max(library, default=0.0)
-        message = "" if found <= allowed else f"error {found:.3g} eps, expected at most {allowed:.3g}"
-        check = _found(f"exposure {exposure:g}", dtype, "exposure", message)
-        yield replace(check, error=found, allowed=allowed, condition=largest)
+        allowed = ALLOWED * max(largest, _LEAST) + max(library, default=0.0)
+        yield bounded("Denoiser", f"exposure {exposure:g}", dtype, "exposure", found, allowed, largest)
 
 
 def _moved(frame: Frame, eps: float, seed: int) -> Frame:
@@ -293,7 +293,3 @@ def _moved(frame: Frame, eps: float, seed: int) -> Frame:
 
 def _scaled(frame: Frame, exposure: float) -> Frame:
     return frame.replace(color=frame.color * exposure)
-
-
-def _found(case: str, dtype: torch.dtype, what: str, message: str) -> Check:
-    return Check("Denoiser", case, name_of(dtype), "", what, 0, 0, 0, not message, message)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from mcdenoise.check.stability._check import DTYPES, name_of
+from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check, bounded, held
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, FrameReport, Output, State
 from mcdenoise.ops import accumulate
@@ -25,152 +25,92 @@ _CONSTANT = 0.3
 _MOTION = (0.375, -0.21875)
 _GHOST = 0.01
 _LIT = 60  # frames, after which the beginning of the exponential window is negligible
-
-
-@dataclass(frozen=True)
-class LongRun:
-    """Result of accumulating a history over many frames.
-
-    Args:
-        name: name of the run.
-        dtype: dtype of the frames.
-        frames: numbers of frames after which the error was measured, ascending.
-        errors: maximum error at these, relative to the maximum accumulated value of the channel.
-        allowed: bound of the errors, or of ``ghost`` in runs that measure it.
-        ghost: number of frames until less than 1 % of a light that went out is left; ``None`` in other runs.
-        passed: whether the run passed.
-        message: description of a failure; empty if the run passed.
-    """
-
-    name: str
-    dtype: str
-    frames: list[int] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
-    allowed: float = 0.0
-    ghost: int | None = None
-    passed: bool = True
-    message: str = ""
+_SHORT = torch.finfo(torch.float32).eps / 2
+_run = partial(bounded, LONG_RUNS)
 
 
 def long_runs(
     dtypes: Sequence[torch.dtype] = DTYPES, frames: int = FRAMES, moving_frames: int = MOVING_FRAMES
-) -> Iterator[LongRun]:
+) -> Iterator[Check]:
     """Perform every run in every dtype.
+
+    A step of ``accumulate`` multiplies the error by ``1 - alpha`` and adds one rounding error of the dtype and at most
+    8 of float32 of the stored value: ``e <= (u + 8 u32) max / alpha``. With a camera that moves by fractions of a pixel
+    ``q = p + motion`` is rounded as a number of up to the image's width ``W``, which makes 4 taps times ``2 u32 W`` of
+    the maximum value.
 
     Args:
         dtypes: dtypes of the frames.
         frames: number of frames with a static camera.
         moving_frames: number of frames with a moving camera.
     """
-    yield from still(dtypes, frames)
-    yield from moving(dtypes, moving_frames)
     for dtype in dtypes:
+        step = torch.finfo(dtype).eps / 2 + 8 * _SHORT
+        yield _drift("still", dtype, frames, (0.0, 0.0), step / ALPHA_MIN)
+        yield _drift("moving", dtype, moving_frames, _MOTION, (step + 8 * max(_SIZE) * _SHORT) / ALPHA_MIN)
         yield cut(dtype)
     # Here the dtype affects only the frames, so one dtype suffices.
-    yield average(max(dtypes, key=_unit), frames)
+    yield average(max(dtypes, key=lambda dtype: torch.finfo(dtype).eps), frames)
     for anti_lag in (False, True):
         yield light_off(anti_lag)
     yield light_on()
 
 
-def still(dtypes: Sequence[torch.dtype] = DTYPES, frames: int = FRAMES) -> list[LongRun]:
+def _drift(name: str, dtype: torch.dtype, frames: int, motion: tuple[float, float], allowed: float) -> Check:
     """``accumulate`` with a history in the dtype itself, against float64 on the same frames.
 
-    A step multiplies the error by ``1 - alpha`` and adds one rounding error of the dtype and at most 8 of float32 of
-    the stored value: ``e <= (u + 8 u32) max / alpha``. A constant channel must not change. The history length must be
-    exact up to the first integer whose successor the dtype cannot represent, and stay there.
+    Without motion a constant channel must not change, and the history length must be exact up to the first integer
+    whose successor the dtype cannot represent, and stay there.
     """
-    motion = torch.zeros(1, 2, *_SIZE)
-    bounds = {dtype: (_unit(dtype) + 8 * _unit(torch.float32)) / ALPHA_MIN for dtype in dtypes}
-    results = _accumulated("still", dtypes, frames, motion, bounds)
-    return list(results)
-
-
-def moving(dtypes: Sequence[torch.dtype] = DTYPES, frames: int = MOVING_FRAMES) -> list[LongRun]:
-    """As :func:`still`, with a camera that moves by fractions of a pixel, so that every step interpolates.
-
-    The bilinear weights add to the error of a step: ``q = p + motion`` is rounded as a number of up to the image's
-    width ``W``, which makes 4 taps times ``2 u32 W`` of the maximum value.
-    """
-    motion = torch.tensor(_MOTION).reshape(1, 2, 1, 1).expand(1, 2, *_SIZE)
-    weights = 8 * max(_SIZE) * _unit(torch.float32)
-    bounds = {dtype: (_unit(dtype) + 8 * _unit(torch.float32) + weights) / ALPHA_MIN for dtype in dtypes}
-    return list(_accumulated("moving", dtypes, frames, motion, bounds))
-
-
-def _accumulated(
-    name: str, dtypes: Sequence[torch.dtype], frames: int, motion: Tensor, bounds: dict[torch.dtype, float]
-) -> Iterator[LongRun]:
-    at = _times(frames)
-    # The history of each dtype, and that of float64, whose length is never rounded.
-    histories = {dtype: _noise(torch.Generator().manual_seed(0)).to(dtype) for dtype in (torch.float64, *dtypes)}
-    lengths = {dtype: torch.ones(1, 1, *_SIZE, dtype=dtype) for dtype in histories}
-    errors: dict[torch.dtype, list[float]] = {dtype: [] for dtype in dtypes}
-    worst = dict.fromkeys(dtypes, 0.0)
-    messages = dict.fromkeys(dtypes, "")
-    generator, largest = torch.Generator().manual_seed(0), torch.zeros(1, 3, 1, 1)
-    for number in range(1, frames + 1):
-        color = _noise(generator) if number > 1 else _noise(torch.Generator().manual_seed(0))
+    worst, message, largest = 0.0, "", torch.zeros(1, 3, 1, 1)
+    both = zip(_histories(dtype, frames, motion), _histories(torch.float64, frames, motion), strict=True)
+    for number, ((history, length, color), (exact, *_)) in enumerate(both, start=1):
         largest = torch.maximum(largest, color.amax((2, 3), keepdim=True))
-        if number > 1:
-            for dtype in histories:
-                histories[dtype], lengths[dtype] = accumulate(
-                    color.to(dtype), histories[dtype], lengths[dtype], motion.to(dtype), alpha_min=ALPHA_MIN
-                )
-        if number not in at:
-            continue
-        for dtype in dtypes:
-            error = float(((histories[dtype].double() - histories[torch.float64]).abs() / largest).max())
-            errors[dtype].append(error)
-            worst[dtype] = max(worst[dtype], error if error == error else math.inf)
-            messages[dtype] = messages[dtype] or _wrong(name, dtype, number, histories[dtype], lengths[dtype])
-    for dtype in dtypes:
-        message = messages[dtype]
-        if worst[dtype] > bounds[dtype]:
-            message = message or f"error {worst[dtype]:.3g}, expected at most {bounds[dtype]:.3g}"
-        yield LongRun(name, name_of(dtype), at, errors[dtype], bounds[dtype], None, not message, message)
+        error = float(((history.double() - exact).abs() / largest).max())
+        worst = max(worst, error if error == error else math.inf)
+        if name == "still" and not message:
+            expected = min(number, round(2 / torch.finfo(dtype).eps))
+            if not (history[:, 1] == torch.tensor(_CONSTANT, dtype=torch.bfloat16).to(dtype)).all():
+                message = f"frame {number}: the constant channel has drifted"
+            elif not (length == expected).all():
+                message = f"frame {number}: expected a history length of {expected}, found {length.max().item():g}"
+    return held(LONG_RUNS, name, dtype, "drift", message) if message else _run(name, dtype, "drift", worst, allowed)
 
 
-def _wrong(name: str, dtype: torch.dtype, number: int, history: Tensor, length: Tensor) -> str:
-    """The error in a history after some frames, or an empty string."""
-    if not torch.isfinite(history).all() or not torch.isfinite(length).all():
-        return f"frame {number}: a value or a length is not finite"
-    if name != "still":
-        return ""
-    if not (history[:, 1] == torch.tensor(_CONSTANT, dtype=torch.bfloat16).to(dtype)).all():
-        return f"frame {number}: the constant channel has drifted"
-    expected = min(number, round(2 / torch.finfo(dtype).eps))
-    if not (length == expected).all():
-        return f"frame {number}: expected a history length of {expected}, found {length.max().item():g}"
-    return ""
+def _histories(dtype: torch.dtype, frames: int, motion: tuple[float, float]) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """The accumulated history after each frame, its length, and the frame."""
+    generator = torch.Generator().manual_seed(0)
+    color = _noise(generator)
+    history, length = color.to(dtype), torch.ones(1, 1, *_SIZE, dtype=dtype)
+    moved = torch.tensor(motion, dtype=dtype).reshape(1, 2, 1, 1).expand(1, 2, *_SIZE)
+    yield history, length, color
+    for _ in range(frames - 1):
+        color = _noise(generator)
+        history, length = accumulate(color.to(dtype), history, length, moved, alpha_min=ALPHA_MIN)
+        yield history, length, color
 
 
-def average(dtype: torch.dtype, frames: int = FRAMES) -> LongRun:
+def average(dtype: torch.dtype, frames: int = FRAMES) -> Check:
     """The mean of all frames (no minimum weight of the current one) in :class:`mcdenoise.models.Accumulated`.
 
     It is stored in float32 for frames of any dtype. The error of frame ``n`` is multiplied by ``(n - 1) / n`` in the
     next one, so that 6 rounding errors per frame sum up to at most ``6 u32 (n + 1) / 2``.
     """
-    at = _times(frames)
     shot = _Shot(alpha_min=1 / (2 * frames), lag_threshold=math.inf)
-    generator = torch.Generator().manual_seed(0)
-    total, errors, message = torch.zeros(1, 3, *_SIZE, dtype=torch.float64), list[float](), ""
-    motion = torch.zeros(1, 2, *_SIZE, dtype=dtype)
+    generator, motion = torch.Generator().manual_seed(0), torch.zeros(1, 2, *_SIZE, dtype=dtype)
+    total, worst = torch.zeros(1, 3, *_SIZE, dtype=torch.float64), 0.0
     for number in range(1, frames + 1):
         color = _noise(generator, fireflies=False).to(dtype)
         mean, length = shot.accumulate(Frame(color=color, motion=motion))
         total += color.double()
-        if number in at:
-            errors.append(float((mean.double() - total / number).abs().max()))
-            if not (length == number).all():
-                message = message or f"frame {number}: found a history length of {length.max().item():g}"
-    allowed = 3 * _unit(torch.float32) * (frames + 1)
-    if not max(errors) <= allowed:
-        message = message or f"error {max(errors):.3g}, expected at most {allowed:.3g}"
-    return LongRun("average", name_of(dtype), at, errors, allowed, None, not message, message)
+        worst = max(worst, float((mean.double() - total / number).abs().max()))
+        if not (length == number).all():
+            message = f"frame {number}: found a history length of {length.max().item():g}"
+            return held(LONG_RUNS, "average", dtype, "drift", message)
+    return _run("average", dtype, "drift", worst, 3 * _SHORT * (frames + 1))
 
 
-def cut(dtype: torch.dtype) -> LongRun:
+def cut(dtype: torch.dtype) -> Check:
     """A scene cut after a long history: the image of the first frame after it is exactly that frame."""
     shot, generator = _Shot(), torch.Generator().manual_seed(0)
     walls = torch.eye(3, dtype=dtype).reshape(3, 1, 3, 1, 1).expand(3, 1, 3, *_SIZE)
@@ -180,11 +120,10 @@ def cut(dtype: torch.dtype) -> LongRun:
     color = _noise(generator, fireflies=False).to(dtype)
     found, length = shot.accumulate(Frame(color=color, normal=walls[1], motion=motion))
     gone = shot.reset == "cut" and torch.equal(found, color.to(found.dtype)) and bool((length == 1).all())
-    message = "" if gone else "part of the scene before the cut is left"
-    return LongRun("cut", name_of(dtype), passed=gone, message=message)
+    return held(LONG_RUNS, "cut", dtype, "cut", "" if gone else "part of the scene before the cut is left")
 
 
-def light_off(anti_lag: bool) -> LongRun:
+def light_off(anti_lag: bool) -> Check:
     """A light that goes out, at one sample per pixel: the number of frames until less than 1 % of it is left.
 
     Without the anti-lag rule it is the first ``k`` with ``(1 - alpha)^k < 0.01``: 44 frames for 0.1. With the rule it
@@ -193,12 +132,10 @@ def light_off(anti_lag: bool) -> LongRun:
     means = _light([1.0] * _LIT + [0.0] * _LIT, anti_lag)[_LIT:]
     ghost = next((number for number, mean in enumerate(means, start=1) if mean < _GHOST), len(means))
     allowed = 1 if anti_lag else math.ceil(math.log(_GHOST) / math.log(1 - ALPHA_MIN))
-    message = "" if ghost <= allowed else f"the ghost lasts {ghost} frames, expected at most {allowed}"
-    name = f"light off, {'with' if anti_lag else 'without'} anti-lag"
-    return LongRun(name, "float32", allowed=allowed, ghost=ghost, passed=not message, message=message)
+    return _run(f"light off, {'with' if anti_lag else 'without'} anti-lag", torch.float32, "ghost", ghost, allowed)
 
 
-def light_on() -> LongRun:
+def light_on() -> Check:
     """Constant light must not be mistaken for lag: with the rule, the noise rises by at most 1 %.
 
     With normal noise 5 % of the windows differ by 2 standard errors, and fewer than one in ten thousand by 4, from
@@ -206,8 +143,7 @@ def light_on() -> LongRun:
     """
     runs = {anti_lag: _light([1.0] * 2 * _LIT, anti_lag, deviation=True)[_LIT:] for anti_lag in (False, True)}
     rise = sum(runs[True]) / sum(runs[False]) - 1
-    message = "" if rise <= _GHOST else f"noise rises by {100 * rise:.2g} %, expected at most 1 %"
-    return LongRun("steady light, with anti-lag", "float32", [_LIT], [rise], _GHOST, None, not message, message)
+    return _run("steady light, with anti-lag", torch.float32, "noise", max(rise, 0.0), _GHOST)
 
 
 def _light(levels: Sequence[float], anti_lag: bool, deviation: bool = False) -> list[float]:
@@ -253,13 +189,3 @@ def _noise(generator: torch.Generator, fireflies: bool = True) -> Tensor:
         hit = torch.rand(1, *_SIZE, generator=generator) < 1e-2
         color[:, 2] = torch.where(hit, 1e4, color[:, 2])
     return color.bfloat16().float()
-
-
-def _times(frames: int) -> list[int]:
-    """The frame numbers 1, 3, 10, 30, 100, ... and the last."""
-    numbers = (digit * 10**power for power in range(9) for digit in (1, 3))
-    return sorted({number for number in numbers if number < frames} | {frames})
-
-
-def _unit(dtype: torch.dtype) -> float:
-    return torch.finfo(dtype).eps / 2

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from itertools import cycle
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.stability._check import DTYPES, Check, bounded, held
+from mcdenoise.check.stability._rounding import Rounded
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Accumulated, Skipping, parts_of
@@ -21,11 +19,7 @@ from mcdenoise.ops import use
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
 _DRAWS = 8
-_LEAST_OF_HALF = torch.finfo(torch.float16).eps / 2
 _LEAST_RADIANCE = 1e-30
-# A convolution rounds weights, activations and results; each is a relative change of its products like the measured
-# one.
-ROUNDED = 3
 # The maximum of eight random perturbations underestimates the true maximum, but hardly by more than this factor.
 ALLOWED = 4
 
@@ -89,8 +83,7 @@ def check_model(name: str, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[C
     model = _without_history(whole)
     if not isinstance(model, nn.Module) or not whole.needs.trainable or model(CASES[0].frame())[1] is not None:
         return
-    with torch.no_grad():
-        exact = _Exact(model, CASES)
+    exact = _Exact(model)
     for dtype in dtypes:
         for case in CASES:
             yield from _check_case(name, model, exact, case, dtype)
@@ -112,26 +105,20 @@ def _image(model: nn.Module, frame: Frame) -> Tensor:
 
 def _check_case(name: str, model: nn.Module, exact: _Exact, case: ModelCase, dtype: torch.dtype) -> Iterator[Check]:
     """Check that image and gradients are finite, and compare the image with float64."""
-    frame = case.frame()
+    frame, about = case.frame(), (name, case.name, dtype)
     color = frame.color.clone().requires_grad_()
     with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
         found = _image(model, frame.replace(color=color))
     valid = bool(torch.isfinite(found).all() and (found >= 0).all())
-    yield Check(
-        name, case.name, name_of(dtype), "", "finite", 0, 0, 0, valid, "" if valid else "NaN, infinite or below 0"
-    )
+    yield held(*about, "finite", "" if valid else "NaN, infinite or below 0")
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     # Differentiate the image relative to its brightness, so that bright images do not overflow the sum; the minimum is
     # 1e-30, as in `auto_exposure`.
-    scale = max(float(frame.color.max()), _LEAST_RADIANCE)
-    if not frame.color.any():
-        scale = 1.0
+    scale = max(float(frame.color.max()), _LEAST_RADIANCE) if frame.color.any() else 1.0
     gradients = torch.autograd.grad((found / scale).sum(), [color, *parameters], allow_unused=True)
     finite = all(bool(torch.isfinite(gradient).all()) for gradient in gradients if gradient is not None)
-    message = "" if finite else "a gradient is NaN or infinite"
-    yield Check(name, case.name, name_of(dtype), "", "gradient", 0, 0, 0, finite, message)
-    with torch.no_grad():
-        yield _compared(name, exact, case, dtype, "forward", found.detach())
+    yield held(*about, "gradient", "" if finite else "a gradient is NaN or infinite")
+    yield exact.compared(*about, "forward", case, found.detach())
 
 
 @torch.no_grad()
@@ -143,122 +130,51 @@ def _check_exposure(name: str, model: nn.Module, exact: _Exact, case: ModelCase,
         current = None if frame.current is None else frame.current * exposure
         with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
             found = _image(model, frame.replace(color=frame.color * exposure, current=current)) / exposure
-        checks.append(_compared(name, exact, case, dtype, "exposure", found))
+        checks.append(exact.compared(name, case.name, dtype, "exposure", case, found))
     return max(checks, key=lambda check: check.error)
 
 
-def _compared(name: str, exact: _Exact, case: ModelCase, dtype: torch.dtype, what: str, found: Tensor) -> Check:
-    unit = torch.finfo(dtype).eps / 2
-    # Everything except convolutions is in float32.
-    response = ROUNDED * max(exact.products(unit)[case.name], torch.finfo(torch.float32).eps) + exact.sums[case.name]
-    error, allowed = relative_change(found, exact.images[case.name]) / (2 * unit), ALLOWED * response / (2 * unit)
-    message = "" if error <= allowed else f"error {error:.3g} eps, expected at most {allowed:.3g}"
-    return Check(name, case.name, name_of(dtype), "", what, error, allowed, response / unit, not message, message)
-
-
 class _Exact:
-    """A model in float64: its images, and how much they change when the model rounds.
+    """A model in float64: its images, and how much they change when each of its steps is rounded.
 
     Args:
         model: in float32.
-        cases: of the images.
     """
 
-    def __init__(self, model: nn.Module, cases: Sequence[ModelCase]) -> None:
-        self._short, self.model = model, copy.deepcopy(model).double()
-        self._squared = {
-            each: _with_squared_weights(each)
-            for each in self.model.modules()
-            if isinstance(each, nn.Conv2d | nn.ConvTranspose2d)
-        }
-        self._frames = {case.name: case.frame().to(torch.float64) for case in cases}
+    def __init__(self, model: nn.Module) -> None:
+        self._model = copy.deepcopy(model).double()
+        self._known: dict[tuple[str, torch.dtype], tuple[Tensor, float]] = {}
+
+    def compared(self, name: str, about: str, dtype: torch.dtype, what: str, case: ModelCase, found: Tensor) -> Check:
+        """Compare an image with the exact one."""
+        if (case.name, dtype) not in self._known:
+            self._known[case.name, dtype] = self._found(case, dtype)
+        image, change = self._known[case.name, dtype]
+        eps = torch.finfo(dtype).eps
+        return bounded(
+            name, about, dtype, what, relative_change(found, image) / eps, ALLOWED * change / eps, 2 * change / eps
+        )
+
+    @torch.no_grad()
+    def _found(self, case: ModelCase, dtype: torch.dtype) -> tuple[Tensor, float]:
+        """The exact image, and its largest change in several experiments."""
+        frame = case.frame().to(torch.float64)
+        # Everything except convolutions is in float32.
+        rounded = Rounded(torch.float32, torch.finfo(torch.float32).eps / 2, convolutions=torch.finfo(dtype).eps / 2)
+        copies = frame.map(lambda image: rounded.rounded(image.repeat(_DRAWS, *(1,) * (image.ndim - 1))))
+        # Like the image, also where a batch is large enough for another backend.
         with use("torch"):
-            self.images = {name: _image(self.model, frame) for name, frame in self._frames.items()}
-        # The largest changes of the images when convolutions are summed in float32.
-        self.sums = self._largest([[name] for name in self.images], [self._summed])
-        self._products: dict[float, dict[str, float]] = {}
-
-    def products(self, unit: float) -> dict[str, float]:
-        """The largest changes of the images when every weight and buffer changes by ``unit`` relatively."""
-        if unit not in self._products:
-            moves = [partial(self._moved, unit=unit, seed=seed) for seed in range(_DRAWS)]
-            alike: dict[tuple[int, int], list[str]] = {}
-            for name, frame in self._frames.items():
-                alike.setdefault(frame.size, []).append(name)
-            # In float64 a batch takes as long as its frames one by one, and in float32 a quarter of it.
-            batches = list(alike.values()) if unit >= _LEAST_OF_HALF else [[name] for name in self.images]
-            self._products[unit] = self._largest(batches, moves)
-        return self._products[unit]
-
-    def _largest(self, batches: list[list[str]], changes: Sequence[Callable[[Frame], Tensor]]) -> dict[str, float]:
-        """The largest change of each case's image; each function may return several copies of the batch."""
-        found = dict.fromkeys(self.images, 0.0)
-        for names in batches:
-            frame = joined([self._frames[name] for name in names])
-            for change in changes:
-                # Like the image, also where a batch is large enough for another backend.
-                with use("torch"):
-                    images = change(frame)
-                for name, image in zip(cycle(names), images.split(1), strict=False):
-                    found[name] = max(found[name], relative_change(image, self.images[name]))
-        return found
-
-    def _moved(self, frame: Frame, unit: float, seed: int) -> Tensor:
-        generator = torch.Generator().manual_seed(seed)
-
-        def move(tensor: Tensor) -> Tensor:
-            signs = torch.randint(0, 2, tensor.shape, generator=generator) * 2 - 1
-            return tensor * (1 + unit * signs)
-
-        # Beside the unit of half precision, rounding in float32 is nothing.
-        model, dtype = (self.model, torch.float64) if unit < _LEAST_OF_HALF else (self._short, torch.float32)
-        weights = {name: move(parameter).to(dtype) for name, parameter in self.model.named_parameters()}
-        output, _ = torch.func.functional_call(model, weights, (frame.map(move).to(dtype),))
-        image: Tensor = output.image
-        return image
-
-    def _summed(self, frame: Frame) -> Tensor:
-        """Images when the result of every convolution changes by the rounding error of a float32 sum of n products.
-
-        The k-th partial sum of products with random signs has the size of sqrt(k) products, and a relative rounding
-        error of ``u``. The rounding errors of all partial sums add up to ``u n / sqrt(2)`` of a product, which is
-        ``u sqrt(n / 2)`` times the root of the sum of squared products (Higham, Accuracy and Stability of Numerical
-        Algorithms, 2002, Sec. 2.8 and 4.2). Every image has several copies, with signs of their own.
-        """
-        generator = torch.Generator().manual_seed(0)
-        unit = torch.finfo(torch.float32).eps / 2
-
-        def change(layer: nn.Module, given: tuple[Any, ...], result: Tensor) -> Tensor:
-            assert isinstance(layer, nn.Conv2d | nn.ConvTranspose2d)
-            # The copies hardly differ.
-            spread = self._squared[layer](given[0][: len(result) // _DRAWS].square(), *given[1:]).sqrt()
-            spread = spread.repeat(_DRAWS, 1, 1, 1)
-            signs: Tensor = torch.randint(0, 2, result.shape, generator=generator) * 2 - 1
-            terms = layer.weight.numel() / layer.out_channels
-            if isinstance(layer, nn.ConvTranspose2d):
-                terms /= math.prod(layer.stride)
-            rounded: Tensor = result + unit * math.sqrt(terms / 2) * spread * signs
-            return rounded
-
-        handles = [layer.register_forward_hook(change) for layer in self._squared]
-        try:
-            return _image(self.model, frame.map(lambda image: image.repeat(_DRAWS, 1, 1, 1)))
-        finally:
-            for handle in handles:
-                handle.remove()
+            image = _image(self._model, frame)
+            with rounded:
+                changed = _image(self._model, copies)
+        largest = max(relative_change(each, image) for each in changed.split(1))
+        return image, max(largest, torch.finfo(torch.float32).eps)
 
 
 def joined(frames: Sequence[Frame]) -> Frame:
     """Frames as one batch."""
     buffers = [dict(frame.items()) for frame in frames]
     return frames[0].replace(**{name: torch.cat([each[name] for each in buffers]) for name in frames[0].buffers})
-
-
-def _with_squared_weights(layer: nn.Module) -> nn.Module:
-    squared = copy.deepcopy(layer).requires_grad_(False)
-    for parameter in squared.parameters():
-        parameter.square_()
-    return squared
 
 
 def relative_change(found: Tensor, expected: Tensor) -> float:

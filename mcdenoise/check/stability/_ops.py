@@ -46,7 +46,6 @@ from mcdenoise.check.stability._check import DTYPES, Check, name_of
 from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.stability._trial import Function, Trial, backends
 from mcdenoise.check.step_cases import STEPS
-from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._window import accumulator_dtype
 from mcdenoise.own import in_one_line
 
@@ -55,10 +54,8 @@ _PROBE = 16
 _AT_ONCE = 256  # perturbed inputs in one batch
 _DRAWS, _ALLOWED = 32, 4
 _NOISE = 1e-12  # relative noise of float64: a vectorised exponential rounds its last elements differently
-_CONSTANT = 0.7
 # Scaling by powers of two does not round, so results must scale exactly: 1.2e-4 and 8.2e3.
 _EXPOSURES = (2.0**-13, 2.0**13)
-ADJOINTS = (("kernel_conv", "kernel_splat"),)
 
 
 @dataclass(frozen=True)
@@ -68,9 +65,6 @@ class _Exact:
     value: Tensor
     condition: Tensor
     bound: Tensor
-
-
-Cache = dict[str, list[_Exact]]
 
 
 def select(names: Sequence[str] | None = None) -> list[Op]:
@@ -96,13 +90,8 @@ def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
     for dtype in dtypes:
         if not op.half_precision and accumulator_dtype(dtype) != dtype:
             continue
-        caches: list[Cache] = [{} for _ in op.cases]
-        for backend in backends(op):
-            for case, cache in zip(op.cases, caches, strict=True):
-                yield from check_case(op, case, dtype, backend, cache)
-        for pair in ADJOINTS:
-            if op.name == pair[0]:
-                yield from _check_adjoint(op, next(other for other in OPS if other.name == pair[1]), dtype)
+        for case in op.cases:
+            yield from check_case(op, case, dtype)
 
 
 def check_stability(
@@ -129,60 +118,49 @@ def check_stability(
     return list(check_op(op_of(function, inputs), dtypes))
 
 
-def check_case(
-    op: Op, case: Case, dtype: torch.dtype, backend: Backend | None = None, cache: Cache | None = None
-) -> list[Check]:
-    """Check an op on one case.
+def check_case(op: Op, case: Case, dtype: torch.dtype) -> Iterator[Check]:
+    """Check an op on one case: each property that applies, on each backend; ``"runs"`` for one that cannot run here.
 
     Args:
         op: an op of the table.
         case: one of its cases.
         dtype: dtype of the inputs.
-        backend: see :func:`backends`.
-        cache: a cache of the exact results for this case and dtype, which take most of the time and are the same for
-            every backend.
-
-    Returns:
-        One check of each property that applies; if the backend cannot run, a single check ``"runs"``.
     """
-    trial = Trial(op, case, dtype, backend, case.inputs(dtype))
+    # Exact results take most of the time, and are the same for every backend.
+    exact: dict[str, list[_Exact]] = {}
+    for backend in backends(op):
+        yield from _checks(Trial(op, case, dtype, backend, case.inputs(dtype)), exact)
+
+
+def _checks(trial: Trial, known: dict[str, list[_Exact]]) -> Iterator[Check]:
+    op = trial.op
     try:
         results = trial.run(trial.leaves)
     except Exception as error:
         # A backend that cannot run on this machine raises a ValueError; a user's function may fail in one dtype only.
         if not (op.own or isinstance(error, ValueError)):
             raise
-        passed = bool(backend) and "can run here" in str(error)
-        message = in_one_line(error) if op.own else str(error)
-        return [Check(op.name, case.name, name_of(dtype), backend or "", "runs", 0, 0, 0, passed, message)]
-    cache = {} if cache is None else cache
-    exact = _once(cache, "forward", _exact_results, trial, results)
-    checks = [_compare(trial, "forward", results, exact)]
-    upstream = [_upstream(result) for result in results]
-    leaves = [*trial.leaves, *upstream]
+        message = in_one_line(error)
+        yield replace(_found(trial, "runs", 0, 0, 0, message), passed=bool(trial.backend) and "can run here" in message)
+        return
+    exact = known["forward"] = known.get("forward") or _exact_results(trial, results)
+    yield _compare(trial, "forward", results, exact)
+    leaves = [*trial.leaves, *map(_upstream, results)]
     try:
         gradients = trial.gradients(leaves)
     except Exception as error:
         if op.own:
-            return [*checks, _found(trial, "gradient", 0, 0, 0, in_one_line(error))]
+            yield _found(trial, "gradient", 0, 0, 0, in_one_line(error))
         # So does a backend without derivatives.
-        if not isinstance(error, ValueError) or not backend or "can run here" not in str(error):
+        elif not isinstance(error, ValueError) or not trial.backend or "can run here" not in str(error):
             raise
     else:
-        true = _once(cache, "gradient", _exact_gradients, trial, leaves, exact)
-        checks.append(_compare(trial, "gradient", gradients, true))
-    if op.weights(case.settings):
-        checks.append(_check_weights(trial, results[0]))
-    if op.images and case.kind != "extreme":
-        checks += [_check_constant(trial, cache), _check_exposure(trial, results[0])]
-    return checks
-
-
-def _once(cache: Cache, what: str, find: Callable[..., list[_Exact]], *arguments: Any) -> list[_Exact]:
-    """The exact results, from the cache if they are in it."""
-    if what not in cache:
-        cache[what] = find(*arguments)
-    return cache[what]
+        true = known["gradient"] = known.get("gradient") or _exact_gradients(trial, leaves, exact)
+        yield _compare(trial, "gradient", gradients, true)
+    if op.weights(trial.case.settings):
+        yield _check_weights(trial, results[0])
+    if op.images and trial.case.kind != "extreme":
+        yield _check_exposure(trial, results[0])
 
 
 def _exact_results(trial: Trial, results: list[Tensor]) -> list[_Exact]:
@@ -350,27 +328,14 @@ def _check_weights(trial: Trial, weights: Tensor) -> Check:
     return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
 
 
-def _check_constant(trial: Trial, cache: Cache) -> Check:
-    """The forward check with constant images: a mean of equal numbers is that number."""
-    inputs = dict(trial.inputs)
-    for name in trial.images:
-        inputs[name] = torch.full_like(_tensor(inputs[name]), _CONSTANT)
-    constant = replace(trial, inputs=inputs)
-    results = constant.run(constant.leaves)
-    exact = _once(cache, "constant", _exact_results, constant, results)
-    return _compare(constant, "constant", results[:1], exact[:1])
-
-
 def _check_exposure(trial: Trial, result: Tensor) -> Check:
     """``f(s x) = s f(x)``, exactly, as long as no value leaves the range of the dtype."""
     message = ""
     for exposure in _EXPOSURES:
-        inputs = dict(trial.inputs)
-        for name in trial.images:
-            inputs[name] = _tensor(inputs[name]) * exposure
-        scaled = replace(trial, inputs=inputs)
-        if not all(bool(_normal_range(_tensor(inputs[name])).all()) for name in trial.images):
+        images = {name: _tensor(trial.inputs[name]) * exposure for name in trial.images}
+        if not all(bool(_normal_range(image).all()) for image in images.values()):
             continue
+        scaled = replace(trial, inputs={**trial.inputs, **images})
         found, expected = scaled.run(scaled.leaves)[0], result * exposure
         if not torch.equal(found, expected) and bool(_normal_range(expected).all()):
             message = f"the result of the image times {exposure:g} is not {exposure:g} times that of the image"
@@ -382,38 +347,6 @@ def _normal_range(tensor: Tensor) -> Tensor:
     # Terms of a sum may be smaller than the sum.
     size = tensor.abs()
     return (size == 0) | ((size >= limits.tiny / limits.eps) & (size <= limits.max / 64))
-
-
-def _check_adjoint(op: Op, transpose: Op, dtype: torch.dtype) -> Iterator[Check]:
-    """``<f(x), y> = <x, f^T(y)>``: both are the same sum, whose terms are rounded like those of a result."""
-    for case in op.cases:
-        if case.kind == "extreme":
-            continue
-        trial = Trial(op, case, dtype, None, case.inputs(dtype))
-        (name,) = op.images
-        x, others = _tensor(trial.inputs[name]), {k: v for k, v in trial.inputs.items() if k != name}
-        result = op.function(**{name: x}, **others, **case.settings)
-        y = _upstream(result)
-        back = transpose.function(**{name: y}, **others, **case.settings)
-        left, right = (result.double() * y.double()).sum(), (x.double() * back.double()).sum()
-        absolute = map_tensors(lambda tensor: tensor.double().abs(), others)
-        terms = (op.function(**{name: x.double().abs()}, **absolute, **case.settings) * y.double().abs()).sum().item()
-        count = _tensor(others["kernel"]).shape[1]
-        # Weights of both signs are normalized by a smaller sum than their absolute values: the terms are larger by that
-        # ratio.
-        if case.settings.get("border") == "renormalize":
-            terms *= _cancellation(_tensor(others["kernel"]))
-        allowed = 2 * (_unit(dtype) + 2 * (count + _DEPTH) * _unit(accumulator_dtype(dtype))) * terms
-        error = abs((left - right).item())
-        message = "" if error <= allowed else f"<f(x), y> = {left:.9g}, <x, f^T(y)> = {right:.9g}"
-        unit = torch.finfo(dtype).eps * terms
-        yield _found(trial, "adjoint", error / unit, allowed / unit, 1.0, message)
-
-
-def _cancellation(kernel: Tensor) -> float:
-    kernel = kernel.double()
-    total = kernel.sum(1).abs()
-    return float((kernel.abs().sum(1) / torch.where(total > 0, total, torch.inf)).max().clamp_min(1))
 
 
 def _found(trial: Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:

@@ -8,6 +8,7 @@ cancel, as those of a quotient's derivative do, and which ones is known to autog
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -31,13 +32,13 @@ _POOL = 2**18
 class Rounded(TorchDispatchMode):
     """Rounds the result of every step at random, by up to ``unit`` relatively; and its terms, where it adds many up.
 
-    Numbers below the smallest normal one of ``dtype`` may become 0.
+    Numbers below the smallest normal one of ``dtype`` may become 0. Convolutions may have a larger unit.
     """
 
-    def __init__(self, dtype: torch.dtype, unit: float, seed: int = 0) -> None:
+    def __init__(self, dtype: torch.dtype, unit: float, convolutions: float = 0.0) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._tiny, self._unit = torch.finfo(dtype).tiny, unit
-        self._generator = torch.Generator().manual_seed(seed)
+        self._tiny, self._unit, self._convolutions = torch.finfo(dtype).tiny, unit, max(unit, convolutions)
+        self._generator = torch.Generator().manual_seed(0)
         self._start, self._signs = 0, self._drawn(_POOL)
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -47,25 +48,29 @@ class Rounded(TorchDispatchMode):
         views = any(each.alias_info is not None for each in returns) and not writes
         if views or func._overloadpacket.__name__ in _EXACT:
             return func(*args, **(kwargs or {}))
+        unit = self._convolutions if func._overloadpacket.__name__ == "convolution" else self._unit
+        moved = partial(self.rounded, unit=unit)
         if torch.Tag.pointwise not in func.tags and not writes:
-            args = pytree.tree_map_only(Tensor, self.rounded, args)
+            args = pytree.tree_map_only(Tensor, moved, args)
         result = func(*args, **(kwargs or {}))
         if writes:
-            result.mul_(self._factor(result)) if result.is_floating_point() else None
+            result.mul_(self._factor(result, unit)) if result.is_floating_point() else None
             return result
-        return pytree.tree_map_only(Tensor, self.rounded, result)
+        return pytree.tree_map_only(Tensor, moved, result)
 
-    def rounded(self, tensor: Tensor) -> Tensor:
-        """The number, moved."""
-        return tensor * self._factor(tensor) if tensor.is_floating_point() and tensor.ndim else tensor
+    def rounded(self, tensor: Tensor, unit: float = 0.0) -> Tensor:
+        """The numbers, moved by the unit, by default that of all steps but convolutions."""
+        if not tensor.is_floating_point() or not tensor.ndim:
+            return tensor
+        return tensor * self._factor(tensor, unit or self._unit)
 
-    def _factor(self, tensor: Tensor) -> Tensor:
+    def _factor(self, tensor: Tensor, unit: float) -> Tensor:
         # Drawing numbers takes longer than most steps, so signs are drawn ahead.
         count = tensor.numel()
         self._start = (self._start + 7919) % _POOL
         signs = self._signs[self._start : self._start + count] if self._start + count <= _POOL else self._drawn(count)
         signs = signs.view(tensor.shape)
-        return 1 + torch.where(tensor.abs() < self._tiny, signs, self._unit * signs)
+        return 1 + torch.where(tensor.abs() < self._tiny, signs, unit * signs)
 
     def _drawn(self, count: int) -> Tensor:
         return torch.randint(0, 2, (count,), generator=self._generator, dtype=torch.float64) * 2 - 1
