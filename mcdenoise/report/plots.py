@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import io
-import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.views import Range, Row, View, front, points
+from mcdenoise.report.views import Row, View, front, points
 from mcdenoise.results import STAGES, Cost, Method, Results
 
 # Okabe and Ito 2008, told apart with every kind of colour blindness; behind them four more, for ten models.
@@ -36,8 +37,6 @@ _MARKERS = {"trainable": "o", "fixed": "s", "baseline": "D"}
 _WIDTH, _HEIGHT = 6.4, 4.4
 # Room for the labels of the vertical ticks, in points.
 _TICK_ROOM = 46.0
-# From a point to its number, in points.
-_CORNERS, _SIDES = ((8, 8), (8, -8), (-8, 8), (-8, -8)), ((11, 0), (-11, 0))
 _STYLE: Any = {
     "axes.axisbelow": True,
     "axes.edgecolor": _MUTED,
@@ -46,6 +45,8 @@ _STYLE: Any = {
     "axes.linewidth": 0.7,
     "axes.spines.right": False,
     "axes.spines.top": False,
+    "axes.xmargin": 0.06,
+    "axes.ymargin": 0.06,
     "figure.dpi": 72,
     "figure.facecolor": "none",
     "font.family": "DejaVu Sans",
@@ -112,21 +113,22 @@ def error_over_time(view: View, metric: str, colors: dict[str, str]) -> Figure:
     axes.set_xlabel("milliseconds a frame, without reading and writing files")
     if not shown:
         return _empty(axes)
-    _log_axis(axes, "x", [time for _, time, _ in shown])
-    if higher:
-        _linear_axis(axes, [error for _, _, error in shown])
-    else:
-        _log_axis(axes, "y", [error for _, _, error in shown])
-    places = {row.number: (time.value, error.value) for row, time, error in shown}
     best = [row.number for row in front(view, metric)]
-    _draw_front(axes, [places[number] for number in best])
     for row, x, y in shown:
         about: Any = {"color": colors[row.method.model], "linewidth": 1.1, "alpha": 0.65, "zorder": 3}
         axes.plot((x.lower, x.upper), (y.value, y.value), **about)
         axes.plot((x.value, x.value), (y.lower, y.upper), **about)
         _mark(axes, row.method, row.number, x.value, y.value, colors[row.method.model])
+        _write_number(axes, row.number, x.value, y.value, bold=row.number in best)
+    _log_axis(axes.xaxis)
+    if not higher:
+        _log_axis(axes.yaxis)
+    # What follows must not move the limits.
+    axes.autoscale_view()
+    axes.set_autoscale_on(False)
+    places = {row.number: (time.value, error.value) for row, time, error in shown}
+    _draw_front(axes, [places[number] for number in best])
     _draw_idle(axes, idle, metric)
-    _write_numbers(axes, places, _CORNERS, bold=best)
     return figure
 
 
@@ -160,10 +162,7 @@ def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
     measured = [(cost, cost.milliseconds) for cost in results.costs if cost.milliseconds is not None]
     if not measured:
         return _empty(axes)
-    _log_axis(axes, "x", [Range(*[_megapixels(cost)] * 3) for cost, _ in measured])
-    _log_axis(axes, "y", [Range(spread.median, spread.lower, spread.upper) for _, spread in measured])
     fits = {fit.method: fit for fit in results.fits}
-    ends = {}
     for number, method in enumerate(results.methods, start=1):
         own = sorted((_megapixels(cost), spread) for cost, spread in measured if cost.method == method.name)
         if not own:
@@ -179,8 +178,9 @@ def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
         for x, spread in own:
             axes.plot([x, x], [spread.lower, spread.upper], color=color, linewidth=1.1)
             _mark(axes, method, number if x == own[0][0] else 0, x, spread.median, color)
-        ends[number] = own[-1][0], own[-1][1].median
-    _write_numbers(axes, ends, _SIDES)
+        _write_number(axes, number, own[-1][0], own[-1][1].median)
+    _log_axis(axes.xaxis)
+    _log_axis(axes.yaxis)
     return figure
 
 
@@ -193,15 +193,14 @@ def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str) -
     """
     figure, axes = _figure(title)
     axes.set_xlabel("samples a pixel")
-    everything = [point for own in curves.values() for point in own]
-    if not everything:
+    if not any(curves.values()):
         return _empty(axes)
-    _log_axis(axes, "x", [Range(*[float(samples)] * 3) for samples, _ in everything])
-    _log_axis(axes, "y", [Range(*[value] * 3) for _, value in everything])
     colors = iter(_COLORS * (1 + len(curves) // len(_COLORS)))
     for name, own in curves.items():
         color = _BASELINE if name == "input" else next(colors)
         axes.plot(*zip(*own, strict=True), color=color, linewidth=1.4, marker="o", markersize=4, label=name)
+    _log_axis(axes.xaxis)
+    _log_axis(axes.yaxis)
     return figure
 
 
@@ -244,25 +243,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     svg = re.sub(r' (?:d|x|y|transform)="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), svg)
     head, rest = svg.split(">", 1)
     head = re.sub(r' (width|height|version)="[^"]*"', "", head)
-    return f'{head} role="img" aria-label="{_attribute(description)}">{rest}'
-
-
-def ticks(low: float, high: float) -> list[float]:
-    """Round numbers for a logarithmic axis: as few as are enough.
-
-    Example:
-        >>> ticks(0.04, 0.5), ticks(3, 2000), ticks(0.064, 0.11)
-        ([0.05, 0.1, 0.2, 0.5], [10.0, 100.0, 1000.0], [0.07, 0.08, 0.09, 0.1, 0.11])
-    """
-    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
-    for parts in ([1], [1, 3], [1, 2, 5]):
-        found = [float(f"{part}e{decade}") for decade in decades for part in parts]
-        found = [value for value in found if low <= value <= high]
-        if len(found) >= 3:
-            return found[:: max(1, len(found) // 7)]
-    # Less than a decade and a half: equal steps, which look nearly equal there.
-    values = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high)
-    return [float(f"{value:.6g}") for value in values if low <= value <= high]
+    return f'{head} role="img" aria-label="{escape(description)}">{rest}'
 
 
 def _figure(title: str) -> tuple[Figure, Axes]:
@@ -295,25 +276,20 @@ def _empty(axes: Axes) -> Figure:
     return _figure_of(axes)
 
 
-def _log_axis(axes: Axes, which: Literal["x", "y"], ranges: Sequence[Range]) -> None:
-    positive = [value for one in ranges for value in (one.value, one.lower, one.upper) if value > 0]
-    low, high = min(positive), max(positive)
-    margin = max((high / low) ** 0.06, 1.06)
-    low, high = low / margin, high * margin
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    (axes.set_xscale if which == "x" else axes.set_yscale)("log")
-    (axes.set_xlim if which == "x" else axes.set_ylim)(low, high)
-    places = ticks(low, high)
-    axis.set_major_locator(FixedLocator(places))
-    axis.set_major_formatter(FixedFormatter([f"{place:g}" for place in places]))
+def _log_axis(axis: Axis) -> None:
+    """Make an axis logarithmic, with round numbers, after everything that its range depends on has been drawn."""
+    across = axis is axis.axes.xaxis
+    (axis.axes.set_xscale if across else axis.axes.set_yscale)("log")
+    low, high = axis.axes.get_xlim() if across else axis.axes.get_ylim()
+    # Within a decade equal steps look nearly equal.
+    few = (
+        MaxNLocator(6, steps=[1, 2, 5, 10])
+        if high < 10 * low
+        else LogLocator(subs=(1, 2, 5) if high < 1e3 * low else (1,))
+    )
+    axis.set_major_locator(few)
+    axis.set_major_formatter(FormatStrFormatter("%g"))
     axis.set_minor_locator(NullLocator())
-
-
-def _linear_axis(axes: Axes, ranges: Sequence[Range]) -> None:
-    values = [value for one in ranges for value in (one.value, one.lower, one.upper) if math.isfinite(value)]
-    low, high = min(values, default=0.0), max(values, default=1.0)
-    margin = 0.06 * (high - low) or 0.05 * abs(high) or 1.0
-    axes.set_ylim(low - margin, high + margin)
 
 
 def _mark(axes: Axes, method: Method, number: int, x: float, y: float, color: str) -> None:
@@ -330,50 +306,19 @@ def _draw_front(axes: Axes, front: Sequence[tuple[float, float]]) -> None:
 
 
 def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
-    """Draw methods without a run time, which a logarithmic axis lacks: a line across, or a note if it is far off."""
-    low, high = axes.get_ylim()
+    """Note methods without a run time, which a logarithmic axis lacks, and draw a line across at their error."""
     for row in rows:
-        value = row.errors[metric].value
-        text = f"{row.method.name} {value:.3g}"
-        if low <= value <= high:
-            axes.axhline(value, color=_BASELINE, linewidth=0.8, linestyle=":")
-            axes.text(0.995, value, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=8.5)
-        else:
-            arrow = "↑" if value > high else "↓"
-            axes.text(
-                1.0,
-                1.015,
-                f"{text} {arrow} (0 ms, off the scale)",
-                transform=axes.transAxes,
-                ha="right",
-                va="bottom",
-                fontsize=8.5,
-                color=_MUTED,
-            )
+        axes.axhline(row.errors[metric].value, color=_BASELINE, linewidth=0.8, linestyle=":")
+    text = ", ".join(f"{row.method.name} {row.errors[metric].value:.3g}" for row in rows)
+    if text:
+        about: Any = {"ha": "right", "va": "bottom", "fontsize": 8.5, "color": _MUTED}
+        axes.text(1.0, 1.015, f"{text} (0 ms)", transform=axes.transAxes, **about)
 
 
-def _write_numbers(
-    axes: Axes,
-    places: Mapping[int, tuple[float, float]],
-    around: Sequence[tuple[float, float]],
-    bold: Collection[int] = (),
-) -> None:
-    """Write each number beside its point, at that offset in points where it is farthest from all others."""
-    taken = [tuple(place) for place in axes.transData.transform(list(places.values()))]
-    for number, (x, y) in zip(places, list(taken), strict=True):
-        free = max(
-            ((x + across, y + up) for across, up in around),
-            key=lambda place: min(math.dist(place, other) for other in taken),
-        )
-        taken.append(free)
-        weight: Any = "bold" if number in bold else "normal"
-        across, up = axes.transData.inverted().transform(free)
-        axes.text(across, up, f"{number}", fontsize=9, fontweight=weight, ha="center", va="center", zorder=5)
+def _write_number(axes: Axes, number: int, x: float, y: float, bold: bool = False) -> None:
+    about: Any = {"textcoords": "offset points", "ha": "center", "va": "center", "zorder": 5}
+    axes.annotate(f"{number}", (x, y), (8, 8), fontsize=9, fontweight="bold" if bold else "normal", **about)
 
 
 def _megapixels(cost: Cost) -> float:
     return cost.width * cost.height / 1e6
-
-
-def _attribute(text: str) -> str:
-    return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")

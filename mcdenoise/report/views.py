@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
+from typing import NamedTuple, TypeVar
 
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.results import STAGES, Method, Results, Spread
 
+T = TypeVar("T")
+
 FILE_STAGES = ("read", "write")
 
 
-@dataclass(frozen=True)
-class Range:
+class Range(NamedTuple):
     """A mean or median with the quartiles of its values; the mean of skewed values may lie outside of them.
 
     Args:
@@ -186,7 +188,7 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
         method,
         number,
         {
-            name: replace(_range(cell.errors_spread[name]), value=x) if name in cell.errors_spread else Range(x, x, x)
+            name: _range(cell.errors_spread[name])._replace(value=x) if name in cell.errors_spread else Range(x, x, x)
             for name, x in cell.errors.items()
         },
         milliseconds,
@@ -216,23 +218,19 @@ def _mean(rows: list[Row], results: Results) -> Row:
         first.method,
         first.number,
         {name: _mean_range([row.errors[name] for row in rows]) for name in known},
-        _mean_of([row.milliseconds for row in rows]),
-        _mean_of([row.whole for row in rows]),
+        _if_all(_mean_range, [row.milliseconds for row in rows]),
+        _if_all(_mean_range, [row.whole for row in rows]),
         {stage: _mean_range([row.stages.get(stage, nothing) for row in rows]) for stage in stages},
-        _mean_number([row.throughput for row in rows]),
-        _mean_number([row.memory for row in rows]),
+        _if_all(fmean, [row.throughput for row in rows]),
+        _if_all(fmean, [row.memory for row in rows]),
     )
 
 
 def _mean_range(ranges: list[Range]) -> Range:
-    return Range(*(fmean(each) for each in zip(*((one.value, one.lower, one.upper) for one in ranges), strict=True)))
+    return Range(*map(fmean, zip(*ranges, strict=True)))
 
 
-def _mean_of(ranges: list[Range | None]) -> Range | None:
-    known = [one for one in ranges if one is not None]
-    return _mean_range(known) if len(known) == len(ranges) else None
-
-
-def _mean_number(numbers: list[float | None]) -> float | None:
-    known = [one for one in numbers if one is not None]
-    return fmean(known) if len(known) == len(numbers) else None
+def _if_all(mean: Callable[[list[T]], T], values: list[T | None]) -> T | None:
+    """The mean, if no value is missing."""
+    known = [value for value in values if value is not None]
+    return mean(known) if len(known) == len(values) else None
