@@ -16,14 +16,13 @@ from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
 from mcdenoise.models import (
     PRECISIONS,
-    Output,
     Skipping,
     has_network,
     list_models,
     parts_of,
     pretrained_models,
 )
-from mcdenoise.models._stopwatch import Moment, Stopwatch
+from mcdenoise.models._times import Times
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 
@@ -54,39 +53,21 @@ class Timed:
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser = denoiser
         self.stages: dict[str, float] = {}
-        self._watch = Stopwatch(denoiser.device)
-        self._marks: list[Moment] = []
-        self._networks = list(_networks(denoiser.model))
-        for module in self._networks:
-            module.register_forward_pre_hook(self._mark)
-            module.register_forward_hook(self._mark)
+        self._networks = [(module, "network") for module in _networks(denoiser.model)]
 
     def __call__(self, frame: Frame) -> Tensor:
         """Denoise the next frame of a shot."""
-        self._marks.clear()
-        start = self._watch.mark()
-        image = self.denoiser(frame)
-        whole = self._watch.between(start, self._watch.mark())
-        times = self.denoiser.report.milliseconds
-        before = sum(times.get(stage, 0.0) for stage in ("validate", "accumulate", "plan"))
-        pairs = zip(self._marks[::2], self._marks[1::2], strict=True)
-        network = sum(self._watch.between(begin, end) for begin, end in pairs)
-        if not self._networks:
-            network = times.get("network", 0.0)
+        times = Times(self.denoiser.device)
+        with times.of("filter"), times.of_modules(self._networks):
+            image = self.denoiser(frame)
+        told, found = self.denoiser.report.milliseconds, times.milliseconds()
+        before = sum(told.get(stage, 0.0) for stage in ("validate", "accumulate", "plan"))
+        # A method without modules tells how long its network took; that of others is taken from outside.
+        inside = {} if self._networks or "network" not in told else {"network": told["network"]}
         # On a GPU the times come from different clocks, so the difference may be slightly negative.
-        self.stages = {"accumulate": before, "network": network, "filter": max(whole - before - network, 0.0)}
-        if not network:
-            del self.stages["network"]
+        rest = max(found["filter"] - before - sum(inside.values()), 0.0)
+        self.stages = {"accumulate": before, **found, **inside, "filter": rest}
         return image
-
-    def output(self, frame: Frame) -> Output:
-        """Denoise the next frame, with the intermediate images; this is not timed."""
-        output = self.denoiser.output(frame)
-        self._marks.clear()
-        return output
-
-    def _mark(self, *_: Any) -> None:
-        self._marks.append(self._watch.mark())
 
 
 def make_method(method: Method, *, threads: int | None = None, device: str = "cpu") -> Timed:

@@ -15,7 +15,7 @@ from torch import Tensor
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
-from mcdenoise.check.case import tensors_in
+from mcdenoise.check.case import as_tuple, tensors_in
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import DTYPES, relative_error
 from mcdenoise.data.files import new_folder
@@ -33,12 +33,14 @@ _WARM_UP = 2
 
 @dataclass
 class _Entry:
-    """One op in one backend and dtype."""
+    """One op in one backend and dtype, at one size."""
 
     op: Op
     case: Case
     backend: Backend
     dtype: torch.dtype
+    inputs: Inputs
+    settings: dict[str, Any]
     times: list[float] = field(default_factory=list)
     mebibytes: float = 0.0
     times_with_derivatives: list[float] = field(default_factory=list)
@@ -47,31 +49,47 @@ class _Entry:
     error: float | None = None
     failure: str = ""
 
+    def run(self, watch: Stopwatch, device: str, warm: bool) -> None:
+        """Call the op once, and once with its derivatives; times count once it is warm."""
+        if self.failure:
+            return
+        try:
+            with torch.inference_mode():
+                self.error = _error(self, device) if self.error is None else self.error
+                start = watch.mark()
+                results = self.call(self.inputs, self.settings)
+                taken = watch.between(start, watch.mark())
+            start = watch.mark()
+            gradients = self._differentiate()
+            with_derivatives = watch.between(start, watch.mark())
+        except Exception as error:  # whatever a backend refuses with: the others go on
+            self.failure = one_line(error)
+            return
+        moved = sum(tensor.nbytes for tensor in (*tensors_in(self.inputs), *results)) / 2**20
+        self.mebibytes = moved
+        if gradients is not None:
+            self.mebibytes_with_derivatives = 2 * moved + sum(gradient.nbytes for gradient in gradients) / 2**20
+        if warm:
+            self.times.append(taken)
+            self.times_with_derivatives += [] if gradients is None else [with_derivatives]
+
     def call(self, inputs: dict[str, Any], settings: dict[str, Any]) -> tuple[Tensor, ...]:
         """The op's results."""
         with use(self.backend):
-            results = self.op.function(**inputs, **settings)
-        return (results,) if isinstance(results, Tensor) else tuple(results)
+            return as_tuple(self.op.function(**inputs, **settings))
 
-    def differentiate(self, inputs: dict[str, Any], settings: dict[str, Any]) -> list[Tensor] | None:
+    def _differentiate(self) -> list[Tensor] | None:
         """Derivatives in all floating-point inputs of the sum of the results, ``None`` if there are none."""
-        leaves: list[Tensor] = []
-
-        def leaf(tensor: Tensor) -> Tensor:
-            if not tensor.is_floating_point():
-                return tensor
-            leaves.append(tensor.detach().requires_grad_())
-            return leaves[-1]
-
-        inputs = map_tensors(leaf, inputs)
+        inputs = map_tensors(lambda x: x.detach().requires_grad_() if x.is_floating_point() else x, self.inputs)
         try:
-            results = [result for result in self.call(inputs, settings) if result.requires_grad]
+            results = [result for result in self.call(inputs, self.settings) if result.requires_grad]
         except ValueError:  # this backend has none
             return None
         if not results:
             return None
         # Made in the rounds that warm up.
         self.upstream = self.upstream or [torch.ones_like(result) for result in results]
+        leaves = [tensor for tensor in tensors_in(inputs) if tensor.requires_grad]
         found = torch.autograd.grad(results, leaves, self.upstream, allow_unused=True)
         return [gradient for gradient in found if gradient is not None]
 
@@ -80,18 +98,15 @@ class _Entry:
         about = self.op.name, self.backend, str(self.dtype).removeprefix("torch."), self.case.name
         if self.failure:
             return OpCost(*about, failure=self.failure)
-        forward, both = (
-            mebibytes * 2**20 / bandwidth * 1e3 for mebibytes in (self.mebibytes, self.mebibytes_with_derivatives)
-        )
-        cost = OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, forward)
+        a_mebibyte = 2**20 * 1e3 / bandwidth
+        cost = OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, self.mebibytes * a_mebibyte)
         if not self.times_with_derivatives:
             return cost
-        spread = Spread.of(self.times_with_derivatives)
         return replace(
             cost,
-            with_derivatives=spread,
+            with_derivatives=Spread.of(self.times_with_derivatives),
             mebibytes_with_derivatives=self.mebibytes_with_derivatives,
-            copy_with_derivatives=both,
+            copy_with_derivatives=self.mebibytes_with_derivatives * a_mebibyte,
         )
 
 
@@ -155,60 +170,30 @@ def _measured(
     ops: list[Op], size: tuple[int, int], rounds: int, device: str, on_step: Callable[[int, int], None]
 ) -> tuple[list[_Entry], float]:
     """What was measured of every op, and the bytes that a copy moves in a second."""
-    source = torch.ones(_COPY_BYTES // 4, device=device)
+    watch, source = Stopwatch(device), torch.ones(_COPY_BYTES // 4, device=device)
     target = torch.empty_like(source)
     copies: list[float] = []
     entries: list[_Entry] = []
     for done, op in enumerate(ops, start=1):
-        own = [_Entry(op, largest_case(op), backend, dtype) for backend in backends_of(op.function) for dtype in DTYPES]
-        _take_turns(own, size, rounds, device, lambda: target.copy_(source), copies)
+        case = largest_case(op)
+        own = [
+            _Entry(op, case, backend, dtype, *enlarged(case, *size, dtype=dtype, device=device))
+            for backend in backends_of(op.function)
+            for dtype in DTYPES
+        ]
+        for turn in range(_WARM_UP + rounds):
+            for entry in own:
+                entry.run(watch, device, turn >= _WARM_UP)
+            start = watch.mark()
+            target.copy_(source)
+            copies += [watch.between(start, watch.mark())] if turn >= _WARM_UP else []
+        for entry in own:
+            # The next ones need the memory.
+            entry.inputs, entry.upstream = {}, []
         entries += own
         on_step(done, len(ops))
     # Read once, and written once.
     return entries, 2 * _COPY_BYTES * 1e3 / Spread.of(copies).median
-
-
-def _take_turns(
-    entries: list[_Entry],
-    size: tuple[int, int],
-    rounds: int,
-    device: str,
-    copy: Callable[[], object],
-    copies: list[float],
-) -> None:
-    watch = Stopwatch(device)
-    inputs = [enlarged(entry.case, *size, dtype=entry.dtype, device=device) for entry in entries]
-    for turn in range(_WARM_UP + rounds):
-        for entry, (tensors, settings) in zip(entries, inputs, strict=True):
-            if entry.failure:
-                continue
-            try:
-                with torch.inference_mode():
-                    if turn == 0:
-                        entry.error = _error(entry, device)
-                    start = watch.mark()
-                    results = entry.call(tensors, settings)
-                    taken = watch.between(start, watch.mark())
-                forward = _bytes(tensors) + sum(result.nbytes for result in results)
-                start = watch.mark()
-                gradients = entry.differentiate(tensors, settings)
-                with_derivatives = watch.between(start, watch.mark())
-            except Exception as error:  # whatever a backend refuses with: the others go on
-                entry.failure = one_line(error)
-                continue
-            entry.mebibytes = forward / 2**20
-            if turn >= _WARM_UP:
-                entry.times.append(taken)
-            if gradients is not None:
-                moved = 2 * forward + sum(gradient.nbytes for gradient in gradients)
-                entry.mebibytes_with_derivatives = moved / 2**20
-                if turn >= _WARM_UP:
-                    entry.times_with_derivatives.append(with_derivatives)
-        start = watch.mark()
-        copy()
-        taken = watch.between(start, watch.mark())
-        if turn >= _WARM_UP:
-            copies.append(taken)
 
 
 def largest_case(op: Op) -> Case:
@@ -264,10 +249,6 @@ def _size(case: Case) -> tuple[int, int]:
     return height, width
 
 
-def _bytes(inputs: Inputs) -> int:
-    return sum(tensor.nbytes for tensor in tensors_in(inputs))
-
-
 def _error(entry: _Entry, device: str) -> float:
     """The largest relative error over the op's ordinary cases."""
 
@@ -278,10 +259,9 @@ def _error(entry: _Entry, device: str) -> float:
         return [result.cpu() for result in entry.call(inputs, settings)]
 
     worst = 0.0
-    for case in entry.op.cases:
-        if case.kind == "ordinary":
-            settings = case.settings
-            worst = max(worst, relative_error(entry.op, case, entry.dtype, on_device))
+    for case in (each for each in entry.op.cases if each.kind == "ordinary"):
+        settings = case.settings
+        worst = max(worst, relative_error(entry.op, case, entry.dtype, on_device))
     if worst == float("inf"):
         raise ArithmeticError("a result is NaN or infinite where float64 is not")
     return worst

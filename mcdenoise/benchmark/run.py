@@ -230,7 +230,7 @@ class _SceneRun:
             for method, timed in self._at_work():
                 output: Output | None = None
                 with self._noted(method.name):
-                    output = timed.output(frame) if self._settings.on_the_way else Output(timed(frame))
+                    output = timed.denoiser.output(frame) if self._settings.on_the_way else Output(timed(frame))
                     self._planned[method.name].append(list(timed.denoiser.report.stages.values()))
                     if frame.reference is not None:
                         self._compare(method.name, number, output, frame.reference)

@@ -38,7 +38,7 @@ from mcdenoise.models._memory import Division, Frames, check_limits
 from mcdenoise.models._precision import Chosen, Precision
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
-from mcdenoise.models._times import Times
+from mcdenoise.models._times import Times, stages_of
 from mcdenoise.models._void import with_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
@@ -345,7 +345,7 @@ class Denoiser:
                 computing,
                 explained(self.model, dtype),
                 times.of(self._name),
-                times.of_modules(self.model, self._name),
+                times.of_modules(stages_of(self.model, self._name)),
             ):
                 output, state = checked_step(self.model, frame, before, self._shape, report.ask)
             with times.of("validate"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -54,15 +54,10 @@ class Times:
             self._spans.append(span)
 
     @contextmanager
-    def of_modules(self, model: Model, name: str) -> Iterator[None]:
-        """Measure each wrapper of a model, and the methods inside, while they run inside this block.
-
-        Args:
-            model: any.
-            name: the stage of methods without weights.
-        """
+    def of_modules(self, modules: Iterable[tuple[nn.Module, str]]) -> Iterator[None]:
+        """Measure these modules, each with the name of its stage, while they run inside this block."""
         handles = []
-        for module, stage in _stages(model, name):
+        for module, stage in modules:
 
             def begin(*_: object, stage: str = stage) -> None:
                 # Another thread may run the same module for a denoiser of its own.
@@ -104,8 +99,13 @@ class Times:
             self._open.pop().end = self._watch.mark()
 
 
-def _stages(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
-    """The wrappers of a model, and the methods inside and in chains, with the names of their stages."""
+def stages_of(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
+    """The wrappers of a model, and the methods inside and in chains, with the names of their stages.
+
+    Args:
+        model: any.
+        name: the stage of methods without weights.
+    """
     for part in model.modules() if isinstance(model, nn.Module) else ():
         if isinstance(part, Chain):
             own: Iterator[Any] = part.children()
