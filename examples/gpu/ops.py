@@ -1,22 +1,22 @@
-"""Compare every operator, compiled by torch, with its plain form in float64 on the CPU, and its time with a copy's.
+"""Compare every operator, compiled by torch, with its plain form in float64, and its time with a copy's.
 
     python examples/gpu/ops.py -o ops.json
 
-A row has the largest errors of the results and of the gradients, relative to the largest value, on 320x180 pixels; or
-the times of a call in float32 on 1280x720 pixels, with and without gradients, beside the time of a copy of as many
-bytes as are read and written. Several processes compile at once, for both; torch keeps what they compile on the disk.
-Times are measured when they have ended.
+A row has an operator without or with gradients on 1280x720 pixels: times of the plain and of the compiled form in
+float32, beside the time of a copy of as many bytes as are read and written, and the largest errors of the compiled
+form, relative to the largest value. Several processes compile at once, and take turns on the device.
 """
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from multiprocessing import get_context
+from itertools import product
+from multiprocessing import TimeoutError, get_context
 from typing import Any
 
 import torch
-from part import SIZES, Part, difference
+from part import SIZES, Part, difference, failure, milliseconds
 from torch import Tensor
 
 from mcdenoise.benchmark.operators import enlarged, largest_case
@@ -40,9 +40,9 @@ FIRST = (
     "demodulate",
 )
 PROCESSES = 14
-COMPARED = (320, 180)
-# The parts of the time after which no process compares, and none compiles.
-COMPARING, COMPILING = 0.5, 0.65
+FORMS = ("without gradients", "with gradients")
+# What the processes take turns with.
+TURN: list[Any] = []
 
 
 def named(name: str) -> Op:
@@ -51,9 +51,9 @@ def named(name: str) -> Op:
 
 
 def differentiated(
-    function: Callable[..., Any], inputs: Inputs, settings: dict[str, Any], weights: Sequence[Tensor] = ()
+    function: Callable[..., Any], inputs: Inputs, settings: dict[str, Any], weights: Sequence[Tensor]
 ) -> list[list[Tensor]]:
-    """The results of a function, and the gradients of a sum of them with weights, by default those of the results."""
+    """The results of a function, and the gradients of a sum of them with weights."""
     leaves: list[Tensor] = []
 
     def leaf(tensor: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ def differentiated(
         return leaves[-1]
 
     results = as_tuple(function(**map_tensors(leaf, inputs), **settings))
-    pairs = [pair for pair in zip(results, weights or weights_of(results), strict=True) if pair[0].requires_grad]
+    pairs = [pair for pair in zip(results, weights, strict=True) if pair[0].requires_grad]
     if not pairs:
         return [list(results), []]
     summed, scales = zip(*pairs, strict=True)
@@ -76,82 +76,77 @@ def weights_of(results: Sequence[Tensor]) -> list[Tensor]:
     return [torch.arange(each.numel()).double().cos().view(each.shape).to(each) for each in results]
 
 
-def compare(name: str, device: str, size: tuple[int, int]) -> dict[str, object]:
-    """Errors of a compiled operator, and the seconds that compiling took."""
+def begin(turn: Any) -> None:
+    """Make one of the processes ready."""
     torch.set_num_threads(1)
-    function = named(name).function
-    inputs, settings = enlarged(largest_case(named(name)), *size, device=device)
-    start = time.monotonic()
-    found = differentiated(compiled(function), inputs, settings)
-    seconds = time.monotonic() - start
-    with use("torch"):
-        exact = differentiated(function, map_tensors(lambda tensor: tensor.double().cpu(), inputs), settings)
-    worst = [max(map(difference, *pair), default=0.0) for pair in zip(found, exact, strict=True)]
-    return {"error": worst[0], "error of gradients": worst[1], "seconds to compile": round(seconds, 1)}
+    TURN.append(turn)
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function compiled for one size of images."""
-    return torch.compile(function, dynamic=False)
+def measured(
+    task: tuple[str, str], device: torch.device, size: tuple[int, int], copy: float, rounds: int
+) -> tuple[str, dict[str, object]]:
+    """The row of an operator in one form; ``copy`` in milliseconds a byte."""
+    (name, form), row = task, dict[str, object]()
+    try:
+        function = named(name).function
+        inputs, settings = enlarged(largest_case(named(name)), *size, device=device.type)
+        with torch.no_grad(), use("torch"):
+            results: Sequence[Tensor] = as_tuple(function(**inputs, **settings))
+        weights, moved = weights_of(results), sum(each.nbytes for each in (*tensors_in(inputs), *results))
+
+        def run(function: Callable[..., Any], inputs: Inputs, weights: Sequence[Tensor]) -> list[list[Tensor]]:
+            with use("torch"):
+                if form == FORMS[1]:
+                    return differentiated(function, inputs, settings, weights)
+                with torch.no_grad():
+                    return [list(as_tuple(function(**inputs, **settings))), []]
+
+        with TURN[0]:
+            row["plain"] = milliseconds(device, partial(run, function, inputs, weights), rounds)
+        row["copy"] = {"ms": round(moved * copy, 4)}
+        start, call = time.monotonic(), partial(run, torch.compile(function, dynamic=False), inputs, weights)
+        found = call()
+        row["seconds to compile"] = round(time.monotonic() - start, 1)
+        with TURN[0]:
+            row["compiled"] = milliseconds(device, call, rounds)
+            exact = run(function, map_tensors(to_float64, inputs), list(map(to_float64, weights)))
+            errors = [max(map(difference, *pair), default=0.0) for pair in zip(found, exact, strict=True)]
+            row |= dict(zip(("error", "error of gradients"), errors, strict=True))
+    except Exception as error:  # whatever a device or a compiler raises
+        row |= failure(error)
+    return f"{name}, {form}", row
 
 
-def forms(name: str, device: str, size: tuple[int, int], *, compiling: bool) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """A call of an operator without and one with gradients; each must be made while it is the last one."""
-    function = named(name).function
-    inputs, settings = enlarged(largest_case(named(name)), *size, device=device)
-    call = compiled(function) if compiling else function
-    with torch.inference_mode(), use("torch"):
-        yield "without gradients", partial(call, **inputs, **settings)
-    with use("torch"):
-        with torch.no_grad():
-            weights = weights_of(as_tuple(function(**inputs, **settings)))
-        yield "with gradients", partial(differentiated, call, inputs, settings, weights)
-
-
-def compile_forms(name: str, device: str, size: tuple[int, int]) -> None:
-    """Compile what is timed later."""
-    for _, call in forms(name, device, size, compiling=True):
-        call()
-
-
-def timed(part: Part, name: str, size: tuple[int, int], copy: float, *, compiling: bool) -> dict[str, object]:
-    """Times of an operator; ``copy`` in milliseconds a byte."""
-    row: dict[str, object] = {
-        form: part.milliseconds(call, rounds=10)
-        for form, call in forms(name, part.device.type, size, compiling=compiling)
-    }
-    function = named(name).function
-    inputs, settings = enlarged(largest_case(named(name)), *size, device=part.device.type)
-    with torch.inference_mode(), use("torch"):
-        results: Sequence[Tensor] = as_tuple(function(**inputs, **settings))
-    moved = sum(each.nbytes for each in (*tensors_in(inputs), *results))
-    return {**row, "copy": {"ms": round(moved * copy, 4)}}
+def to_float64(tensor: Tensor) -> Tensor:
+    """The same numbers in double precision; whole numbers as they are."""
+    return tensor.double() if tensor.is_floating_point() else tensor
 
 
 def main() -> None:
     part = Part.begin(__doc__)
     names = list(dict.fromkeys((*FIRST, *(op.function.__name__ for op in OPS))))
-    size, compared, processes, seconds = SIZES[0], COMPARED, PROCESSES, part.left
+    size, processes, rounds = SIZES[0], PROCESSES, 10
     if part.quick:
-        names, size, compared, processes = names[:1], (64, 48), (48, 32), 1
-    device = part.device.type
-    # Each process compiles by itself.
-    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
-    with get_context("spawn").Pool(processes) as pool:
-        found = {name: pool.apply_async(compare, (name, device, compared)) for name in names}
-        ready = [pool.apply_async(compile_forms, (name, device, size)) for name in names]
-        for name, result in found.items():
-            left = part.left - seconds * (1 - COMPARING)
-            part.attempt(f"{name}: errors", partial(result.get, max(left, 0.01)))
-        for done in ready:
-            done.wait(max(part.left - seconds * (1 - COMPILING), 0.01))
+        names, size, processes, rounds = names[:1], (64, 48), 1, 2
     source = torch.ones(2**26, device=part.device)
     target = torch.empty_like(source)
     copy = float(str(part.milliseconds(lambda: target.copy_(source))["ms"])) / (2 * source.nbytes)
-    for compiling in (False, True):
-        for name in names:
-            measure = partial(timed, part, name, size, copy, compiling=compiling)
-            part.attempt(f"{name}: times, {'compiled' if compiling else 'plain'}", measure)
+    # Each process compiles by itself.
+    os.environ.setdefault("TORCHINDUCTOR_COMPILE_THREADS", "1")
+    context, tasks = get_context("spawn"), [(name, form) for form, name in product(FORMS, names)]
+    missing = {f"{name}, {form}" for name, form in tasks}
+    with context.Pool(processes, begin, (context.Lock(),)) as pool:
+        measure = partial(measured, device=part.device, size=size, copy=copy, rounds=rounds)
+        rows = pool.imap_unordered(measure, tasks)
+        try:
+            for _ in tasks:
+                name, row = rows.next(part.left)
+                missing.remove(name)
+                part.add(name=name, **row)
+        except TimeoutError:
+            pool.terminate()
+    for name in sorted(missing):
+        part.add(name=name, failed="not reached in time")
 
 
 if __name__ == "__main__":

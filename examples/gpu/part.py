@@ -78,20 +78,30 @@ class Part:
                 torch.cuda.synchronize()
                 torch.cuda.empty_cache()
         except Exception as error:  # whatever a device or a compiler raises
-            found = {"failed": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+            found = failure(error)
         self.add(name=name, **found)
 
     def milliseconds(self, call: Callable[[], object], rounds: int = 20) -> dict[str, object]:
-        """Median and quartiles of the time of a call on the device; the first rounds warm up."""
-        watch, times = Stopwatch(self.device), []
-        for turn in range(_WARM_UP + (2 if self.quick else rounds)):
-            start = watch.mark()
-            call()
-            taken = watch.between(start, watch.mark())
-            if turn >= _WARM_UP:
-                times.append(taken)
-        low, median, high = statistics.quantiles(times, n=4)
-        return {"ms": round(median, 4), "quartiles": [round(low, 4), round(high, 4)]}
+        """See :func:`milliseconds`; few rounds if the part is quick."""
+        return milliseconds(self.device, call, 2 if self.quick else rounds)
+
+
+def failure(error: Exception) -> dict[str, object]:
+    """What a row says about an error: some errors of compilers cannot be sent from process to process."""
+    return {"failed": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"}
+
+
+def milliseconds(device: torch.device, call: Callable[[], object], rounds: int = 20) -> dict[str, object]:
+    """Median and quartiles of the time of a call on the device; the first rounds warm up."""
+    watch, times = Stopwatch(device), []
+    for turn in range(_WARM_UP + rounds):
+        start = watch.mark()
+        call()
+        taken = watch.between(start, watch.mark())
+        if turn >= _WARM_UP:
+            times.append(taken)
+    low, median, high = statistics.quantiles(times, n=4)
+    return {"ms": round(median, 4), "quartiles": [round(low, 4), round(high, 4)]}
 
 
 @cache

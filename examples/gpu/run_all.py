@@ -18,7 +18,7 @@ from mcdenoise.data.files import write_json
 from mcdenoise.errors import InputError
 
 # Seconds of each part once Python and torch have started; rows that have begun then still end.
-PARTS = {"about": 15, "models": 80, "peer": 12, "mitsuba_loop": 20, "training": 22, "ops": 70}
+PARTS = {"about": 15, "models": 100, "peer": 12, "mitsuba_loop": 20, "training": 22, "ops": 70}
 
 
 def run(name: str, out: Path, options: list[str], seconds: float) -> dict[str, object]:
