@@ -8,16 +8,12 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from mcdenoise.check.case import Case, Draw, Inputs, Op, between, constant, dim, normal, radiance, times, uniform
-from mcdenoise.check.regimes import IMAGES, SMALL, Size, crossed, extreme, ordinary, stiff
+from mcdenoise import ops
+from mcdenoise.check.case import Draw, Inputs, Op, between, constant, dim, normal, radiance, times, uniform
+from mcdenoise.check.regimes import IMAGES, SMALL, Size, checked, extreme, ordinary, stiff
 from mcdenoise.ops._grid import cells_of
-from mcdenoise.ops.atrous import Atrous, atrous
-from mcdenoise.ops.bilateral_grid import GridSlice, GridSplat, grid_slice, grid_splat
-from mcdenoise.ops.demodulation import Demodulate, Remodulate, demodulate, remodulate
-from mcdenoise.ops.fireflies import ClampFireflies, clamp_fireflies
-from mcdenoise.ops.fusion import LaplacianFusion, downsample, laplacian_fusion, upsample
-from mcdenoise.ops.moments import MomentsVariance, luminance_moments, moments_variance
-from mcdenoise.ops.regression import BlockRegression, block_regression
+
+_IMAGE = ("image",)
 
 
 def _half(size: Size) -> Size:
@@ -37,16 +33,17 @@ def _fused(g: Generator, size: Size, image: Draw, alpha: Draw = uniform, alphas:
     return {"fine": fine, "coarse": coarse, "alpha": alpha(g, size[0], alphas, *size[2:])}
 
 
-_FUSIONS = crossed(
-    laplacian_fusion,
+_FUSION = checked(
+    ops.laplacian_fusion,
     _fused,
     ordinary("an alpha for each channel", (1, 3, 3, 2), alphas=3),
     *(extreme(f"alpha {value}", alpha=constant(value)) for value in (0, 1)),
+    images=("fine", "coarse"),
 )
 
 
-def _demodulations(function: Any) -> tuple[Case, ...]:
-    name = "color" if function is demodulate else "image"
+def _demodulation(function: Any) -> Op:
+    name = "color" if function is ops.demodulate else "image"
 
     def build(g: Generator, size: Size, image: Draw, albedo: Draw = between(0.05, 1)) -> Inputs:
         return {name: image(g, *size), "albedo": albedo(g, *size)}
@@ -65,7 +62,7 @@ def _demodulations(function: Any) -> tuple[Case, ...]:
         """Half-precision albedos on both sides of the threshold below which a pixel counts as untextured."""
         return 1e-4 * (1 + 2.0 ** -uniform(g, *shape, low=6, high=12) * torch.sign(normal(g, *shape)))
 
-    return crossed(
+    return checked(
         function,
         build,
         ordinary("floor 0.5", (1, 3, 1, 2), uniform, floor=0.5),
@@ -74,6 +71,7 @@ def _demodulations(function: Any) -> tuple[Case, ...]:
         *(extreme(f"albedo {value:g}", albedo=constant(value)) for value in (0, 1e-8, 1e-4, 5, 1e4)),
         extreme("albedo about 1e-4", (1, 3, 5, 7), albedo=barely),
         image=uniform,
+        images=(name,),
     )
 
 
@@ -98,11 +96,10 @@ def _half_range(g: Generator, *shape: int) -> Tensor:
     return drawn
 
 
-_CLAMPED = crossed(
-    clamp_fireflies,
+_FIREFLIES = checked(
+    ops.clamp_fireflies,
     _clamped,
     ordinary("5x7, one firefly", (1, 1, 5, 7), uniform, fireflies=[(2, 3)]),
-    ordinary("one column", (1, 3, 5, 1), uniform, limit=1.2, kernel_size=3),
     ordinary("constant", (1, 3, 3, 4), constant(0.3)),
     *(
         stiff(f"fireflies at {at}", (1, 3, 4, 5), uniform, fireflies=at, limit=2.0)
@@ -114,12 +111,12 @@ _CLAMPED = crossed(
     extreme("1e30 beside 1e-4", (1, 3, 3, 5), constant(1e-4), fireflies=[(1, 4)], value=1e30),
     extreme("range of half precision", (1, 3, 3, 5), _half_range, ("image",), limit=1.1),
     *(extreme(f"limit {limit:g}", limit=limit) for limit in (1e-6, 1e30)),
-    extreme("window of 99", kernel_size=99),
     # Small windows have low limits, so that they clamp some pixels too.
     settings=({"limit": 2.0}, {"limit": 1.5, "kernel_size": 3}, {"limit": 1.2, "kernel_size": 5}, {"limit": 2.0}),
     image=uniform,
-    images={name: draw for name, draw in IMAGES.items() if "signs" not in name},
+    limits={name: draw for name, draw in IMAGES.items() if "signs" not in name},
     fireflies=stiff("fireflies of 100", (1, 3, 3, 4), radiance, limit=2.0),
+    images=_IMAGE,
 )
 
 
@@ -164,21 +161,29 @@ _CELLS = (
     {"cell": 1, "bins": 3},
     {"cell": 2, "bins": 1},
 )
+
+
+def _guide_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
+    """The coordinate of a guide, and the height of a tent, are rounded like a guide of 1."""
+    return {"guide": inputs["guide"].abs().clamp_min(1)}
+
+
 # Finite differences in the guide of a firefly are too inaccurate for the dark pixels beside it.
-_SPLATS = crossed(
-    grid_splat,
+_SPLAT = checked(
+    ops.grid_splat,
     _splatted,
     extreme("bright fireflies", (1, 3, 3, 3), smooth=("image",), cell=2, bins=2),
     *(extreme(f"guide {name}", guide=draw, cell=2, bins=4) for name, draw in _GUIDES.items()),
     # At bin centres the tents of the neighbouring bins end.
     extreme("guide at the centres of bins", (1, 1, 2, 3), guide=_two, cell=2, bins=256),
-    extreme("cells larger than the image", cell=100, bins=4),
     settings=_CELLS,
     sizes=SMALL,
     fireflies=stiff("fireflies", (1, 1, 2, 3), dim, cell=2, bins=2),
+    images=_IMAGE,
+    rounds=_guide_rounds,
 )
-_SLICES = crossed(
-    grid_slice,
+_SLICE = checked(
+    ops.grid_slice,
     _sliced,
     ordinary("all filled", (1, 2, 2, 3), smooth=("grid",), filled=constant(1), cell=2, bins=1),
     extreme("bright fireflies", (1, 3, 3, 3), smooth=("grid",), cell=2, bins=2),
@@ -190,12 +195,9 @@ _SLICES = crossed(
     settings=_CELLS,
     sizes=SMALL,
     fireflies=stiff("fireflies", (1, 1, 2, 3), dim, cell=2, bins=2),
+    images=("grid",),
+    rounds=_guide_rounds,
 )
-
-
-def _guide_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
-    """The coordinate of a guide, and the height of a tent, are rounded like a guide of 1."""
-    return {"guide": inputs["guide"].abs().clamp_min(1)}
 
 
 def wall(g: Generator, size: Size) -> dict[str, Tensor]:
@@ -244,13 +246,12 @@ def _corner(drawn: Inputs) -> None:
 
 _FOUR = (1, 1, 1, 4)
 _FAR = (0.0, 1e-30, 1e30, math.inf)
-_ATROUS = crossed(
-    atrous,
+_ATROUS = checked(
+    ops.atrous,
     _lit,
     ordinary("light alone", (1, 3, 2, 2), uniform, inputs=("light", "variance")),
     ordinary("normals", _FOUR, uniform, inputs=("light", "variance", "normal")),
     ordinary("taps 2 pixels apart", _FOUR, uniform, step=2),
-    ordinary("other tolerances", _FOUR, uniform, sigma_z=3.0, sigma_n=8.0, sigma_l=1.0),
     stiff("little noise", (1, 3, 1, 3), times(100, uniform), noise=0.02),
     stiff("an edge", _FOUR, uniform, ("light", "variance"), change=_corner),
     # Infinity has no finite difference.
@@ -282,14 +283,13 @@ def _moments(
     return seen(drawn, inputs, None, None, g)
 
 
-_MOMENTS = crossed(
-    moments_variance,
+_VARIANCE = checked(
+    ops.moments_variance,
     _moments,
     ordinary("the pixel alone", (1, 1, 3, 4), uniform, inputs=("moments",)),
     ordinary("moments alone", (1, 1, 2, 5), uniform, inputs=("moments",), kernel_size=3),
     stiff("moments that cancel", (1, 1, 3, 3), uniform, inputs=("moments",), spread=1e-3),
     extreme("moments that cancel altogether", (1, 3, 3, 5), spread=0.0),
-    extreme("window of 11", kernel_size=11),
     settings=(
         {"kernel_size": 3},
         {"kernel_size": 7},
@@ -318,46 +318,39 @@ def _nearly(g: Generator, *shape: int) -> Tensor:
     return torch.cat([first, first + 1e-3 * normal(g, shape[0], 1, *shape[2:])], 1)
 
 
-_BLOCK, _ONLY_IMAGE = (1, 1, 4, 4), ("image",)
-_REGRESSIONS = crossed(
-    block_regression,
+_BLOCK = (1, 1, 4, 4)
+_REGRESSION = checked(
+    ops.block_regression,
     _regressed,
     ordinary("one block", _BLOCK, block=4),
     ordinary("a square", _BLOCK, block=4, squares=1),
     ordinary("blocks of 3, a large ridge", (1, 2, 4, 3), block=3, ridge=0.1, squares=2),
     ordinary("one row", (1, 1, 1, 6), count=1, block=4, offset=(3, 2)),
-    stiff("features that differ by a thousandth", _BLOCK, smooth=_ONLY_IMAGE, features=_nearly, block=4),
-    stiff("millimetres", _BLOCK, smooth=_ONLY_IMAGE, features=between(5e3, 6e3), count=3, squares=3, block=4),
+    stiff("features that differ by a thousandth", _BLOCK, smooth=_IMAGE, features=_nearly, block=4),
+    stiff("millimetres", _BLOCK, smooth=_IMAGE, features=between(5e3, 6e3), count=3, squares=3, block=4),
     # Finite differences are too inaccurate for dependent features, and for features with a large mean.
-    extreme("a flat wall", (1, 1, 4, 5), normal, _ONLY_IMAGE, features=_dependent, squares=1, block=4),
-    extreme("features all equal", (1, 3, 4, 4), normal, _ONLY_IMAGE, features=constant(0.3), squares=2, block=4),
-    extreme("positions of 1e6", _BLOCK, normal, _ONLY_IMAGE, features=between(1e6, 1e6 + 1), squares=2, block=4),
-    extreme("more features than pixels", (1, 1, 2, 2), normal, _ONLY_IMAGE, count=5, squares=2, block=4),
+    extreme("a flat wall", (1, 1, 4, 5), normal, _IMAGE, features=_dependent, squares=1, block=4),
+    extreme("positions of 1e6", _BLOCK, normal, _IMAGE, features=between(1e6, 1e6 + 1), squares=2, block=4),
+    extreme("more features than pixels", (1, 1, 2, 2), normal, _IMAGE, count=5, squares=2, block=4),
     # No squares: a feature that is nearly all in one pixel is proportional to its square.
     *(extreme(f"features {name}", features=draw, block=3, offset=(1, 2)) for name, draw in IMAGES.items()),
     settings=({"block": 3, "offset": (1, 2), "squares": 1},),
-    fireflies=stiff("fireflies", _BLOCK, radiance, _ONLY_IMAGE, block=4),
-    smooth=_ONLY_IMAGE,
+    fireflies=stiff("fireflies", _BLOCK, radiance, _IMAGE, block=4),
+    smooth=_IMAGE,
+    images=_IMAGE,
 )
 
-_IMAGE = ("image",)
-RESOLUTIONS = (
-    Op(downsample, crossed(downsample, _image), images=_IMAGE),
-    Op(upsample, crossed(upsample, _halved), images=_IMAGE),
-    Op(laplacian_fusion, _FUSIONS, LaplacianFusion, images=("fine", "coarse")),
+OPS = (
+    checked(ops.downsample, _image, images=_IMAGE),
+    checked(ops.upsample, _halved, images=_IMAGE),
+    _FUSION,
+    _demodulation(ops.demodulate),
+    _demodulation(ops.remodulate),
+    _SPLAT,
+    _SLICE,
+    _FIREFLIES,
+    _ATROUS,
+    checked(ops.luminance_moments, _light, image=uniform, least_dtype=torch.float32),
+    _VARIANCE,
+    _REGRESSION,
 )
-ALBEDO = (
-    Op(demodulate, _demodulations(demodulate), Demodulate, images=("color",)),
-    Op(remodulate, _demodulations(remodulate), Remodulate, images=_IMAGE),
-)
-GRID = (
-    Op(grid_splat, _SPLATS, GridSplat, images=_IMAGE, rounds=_guide_rounds),
-    Op(grid_slice, _SLICES, GridSlice, images=("grid",), rounds=_guide_rounds),
-)
-FIREFLIES = Op(clamp_fireflies, _CLAMPED, ClampFireflies, images=_IMAGE)
-ATROUS = Op(atrous, _ATROUS, Atrous)
-MOMENTS = (
-    Op(luminance_moments, crossed(luminance_moments, _light, image=uniform), least_dtype=torch.float32),
-    Op(moments_variance, _MOMENTS, MomentsVariance),
-)
-REGRESSION = Op(block_regression, _REGRESSIONS, BlockRegression, images=_IMAGE)

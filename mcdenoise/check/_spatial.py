@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
 
+from mcdenoise import ops
 from mcdenoise.check.case import (
-    Case,
     Draw,
     Inputs,
     Op,
@@ -25,16 +25,10 @@ from mcdenoise.check.case import (
     times,
     uniform,
 )
-from mcdenoise.check.regimes import SMALL, Size, crossed, extreme, ordinary, stiff
+from mcdenoise.check.regimes import SMALL, Size, checked, extreme, ordinary, stiff
 from mcdenoise.ops._window import inside, offsets, pad, shifted
-from mcdenoise.ops.affinity import AffinityFilter, affinity_filter
-from mcdenoise.ops.bilateral import CrossBilateralWeights, cross_bilateral_weights
-from mcdenoise.ops.bilateral_filter import CrossBilateralFilter, cross_bilateral_filter
-from mcdenoise.ops.importance import ImportanceFilter, importance_filter
-from mcdenoise.ops.kernel_conv import KernelConv, KernelSplat, kernel_conv, kernel_splat
-from mcdenoise.ops.partition import learned_upsample, pyramid_partition
-from mcdenoise.ops.softmax_splat import softmax_splat
 
+_IMAGE = ("image",)
 _TINY = torch.finfo(torch.float32).tiny / torch.finfo(torch.float32).eps
 
 
@@ -53,16 +47,15 @@ def _filtered(g: Generator, size: Size, image: Draw, kernel: Draw = between(0.5,
     return {"image": image(g, *size), "kernel": kernel(g, size[0], kernel_size**2, *size[2:])}
 
 
-def _filters(function: Any) -> tuple[Case, ...]:
+def _filter(function: Any) -> Op:
     def no_weight(g: Generator, *shape: int) -> Tensor:
         kernel = uniform(g, *shape, low=0.5)
         kernel[..., 0, 0] = 0
         return kernel
 
-    return crossed(
+    return checked(
         function,
         _filtered,
-        ordinary("5x5 taps, RGB", (1, 3, 2, 3), border="replicate", kernel_size=5),
         ordinary("weights of both signs", (1, 3, 2, 3), kernel=between(-1, 1), border="zeros"),
         stiff("peaked weights", (1, 3, 2, 3), radiance, kernel=softmax(15), border="replicate"),
         stiff("sum of the weights of 1e-3", smooth=("image",), kernel=softmax(3, 1e-3), border="renormalize"),
@@ -83,6 +76,7 @@ def _filters(function: Any) -> tuple[Case, ...]:
             {"border": "replicate", "kernel_size": 5},
             {"border": "renormalize", "kernel_size": 5},
         ),
+        images=_IMAGE,
     )
 
 
@@ -90,16 +84,15 @@ def _splatted(g: Generator, size: Size, image: Draw, logits: Draw = normal, kern
     return {"image": image(g, *size), "logits": logits(g, size[0], kernel_size**2, *size[2:])}
 
 
-_SPLATS = crossed(
-    softmax_splat,
+_SPLAT = checked(
+    ops.softmax_splat,
     _splatted,
     extreme("logits of 1e4", logits=times(1, normal, 1e4)),
-    extreme("logits of -1e4", logits=times(1, normal, -1e4)),
     extreme("logits to +-1e4", logits=times(1e4, normal)),
-    extreme("all logits equal", logits=constant(0)),
     extreme("7x7 on 1x2", (1, 3, 1, 2), kernel_size=7),
     settings=({}, {"kernel_size": 5}, {}, {}, {"kernel_size": 1}),
     fireflies=stiff("fireflies, peaked weights", (1, 3, 2, 3), radiance, logits=times(8, normal)),
+    images=_IMAGE,
 )
 
 
@@ -135,72 +128,6 @@ def _bilateral(
     }
 
 
-def _bilateral_cases(function: Any) -> tuple[Case, ...]:
-    def far_and_near(g: Generator, *shape: int) -> Tensor:
-        """Depths of 1e10, as of a sky, beside depths of 0 to 1."""
-        return torch.where(uniform(g, *shape) < 0.5, 1e10, uniform(g, *shape))
-
-    def normals(length: float) -> Draw:
-        """Normals of which some are zero and the others have this length."""
-        return lambda g, *shape: length * F.normalize(normal(g, *shape)) * (uniform(g, shape[0], 1, *shape[2:]) < 0.7)
-
-    def row(name: str, scale: float = 1.0, size: Size = (1, 3, 2, 3), **given: Any) -> Any:
-        return extreme(name, size, scale=scale, **{"border": "renormalize", "distance": 1.0, **given})
-
-    small, flat = between(-1e-4, 1e-4), constant(0.5)
-    exact: dict[str, Any] = {"border": "renormalize", "distance": 1.0}
-    filtered = function is cross_bilateral_filter
-    infinite = row("one weight infinite", guide=flat, kernel=some(torch.inf, uniform), normalize="none")
-    return crossed(
-        function,
-        partial(_bilateral, filtered=filtered),
-        ordinary("5x5 taps, normals and depth", (1, 3, 1, 2), kernel_size=5, channels=(3, 1)),
-        ordinary("no guides", (1, 3, 2, 3), channels=(), distance=None),
-        ordinary("distance only", (1, 1, 3, 2), channels=()),
-        ordinary("zero falloffs", scale=0.0),
-        stiff("falloffs up to 1e3", guide=between(0, 0.1), scale=1e3),
-        stiff("Eq. 5, falloffs up to 1e3", guide=between(0, 0.1), scale=1e3, normalize="none"),
-        stiff("f of 1e6, guides 1e-4 apart", guide=small, scale=1e6, **exact),
-        # Known to eps times the logits.
-        replace(
-            stiff("logits 1e4 and 1 apart", guide=between(-1, 1), kernel=times(1, between(-1, 1), 1e4), **exact),
-            kind="extreme",
-        ),
-        row("f of 1e8, guides 1e-4 apart", 1e8, guide=small),
-        row("f of 1e8, guides 1 apart", 1e8, guide=between(-1, 1)),
-        row("f of 1e8, guides of 1e4 and 1e-4 apart", 1e8, guide=times(1, small, 1e4)),
-        row("constant guide, f of 1e8", 1e8, guide=flat),
-        row("logits to +-1e4", guide=flat, kernel=between(-1e4, 1e4)),
-        row("logits of -1e4", guide=flat, kernel=times(1, between(-1, 1), -1e4)),
-        row("one logit infinite", guide=flat, kernel=some(torch.inf)),
-        row("one logit of minus infinity", guide=flat, kernel=some(-torch.inf)),
-        row("all weights zero, as logits", guide=flat, kernel=constant(-torch.inf)),
-        row("all weights zero", guide=flat, kernel=constant(0), normalize="none"),
-        # A mean with an infinite weight is undefined.
-        *(() if filtered else (infinite,)),
-        row("Eq. 5, f of 1e8", 1e8, guide=between(-1, 1), kernel=uniform, normalize="none"),
-        row("Eq. 5, weights of 1e30", guide=between(-1, 1), kernel=between(-1e30, 1e30), normalize="none"),
-        row("depth 0 and 1e10", 1e8, guide=far_and_near),
-        *(row(f"normals of length 0 and {n:g}", 1e3, guide=normals(n), channels=(3,)) for n in (1, 1e3)),
-        row("64 channels", 1e3, channels=(64,)),
-        row("7x7 on 1x2", 1e3, (1, 3, 1, 2), kernel_size=7, border="zeros"),
-        row("one pixel, f of 1e8", 1e8, (1, 1, 1, 1)),
-        row("one row of 9, f of 1e8", 1e8, (1, 1, 1, 9), border="replicate"),
-        row("no image", size=(0, 3, 3, 4)),
-        settings=(
-            {"normalize": "softmax", "border": "replicate"},
-            {"normalize": "none", "border": "zeros", "channels": (3,)},
-            {"normalize": "softmax", "border": "renormalize", "channels": (1, 1)},
-            {"normalize": "none", "border": "renormalize"},
-            {"normalize": "softmax", "border": "zeros", "channels": (3, 1), "distance": None},
-            {"normalize": "none", "border": "replicate", "channels": (3, 1)},
-        ),
-        sizes=SMALL,
-        images={},
-        fireflies=stiff("fireflies", (1, 3, 2, 3), dim) if filtered else None,
-    )
-
-
 def _bilateral_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
     """The exponent is a sum of large terms; its rounding error counts as that of a logit of the sum of their sizes.
 
@@ -225,13 +152,76 @@ def _bilateral_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[
     return {"kernel": own * (1 + terms) if settings.get("normalize") == "none" else own + terms}
 
 
+def _weighted(function: Any) -> Op:
+    def far_and_near(g: Generator, *shape: int) -> Tensor:
+        """Depths of 1e10, as of a sky, beside depths of 0 to 1."""
+        return torch.where(uniform(g, *shape) < 0.5, 1e10, uniform(g, *shape))
+
+    def normals(length: float) -> Draw:
+        """Normals of which some are zero and the others have this length."""
+        return lambda g, *shape: length * F.normalize(normal(g, *shape)) * (uniform(g, shape[0], 1, *shape[2:]) < 0.7)
+
+    def row(name: str, scale: float = 1.0, size: Size = (1, 3, 2, 3), **given: Any) -> Any:
+        return extreme(name, size, scale=scale, **{"border": "renormalize", "distance": 1.0, **given})
+
+    small, flat = between(-1e-4, 1e-4), constant(0.5)
+    exact: dict[str, Any] = {"border": "renormalize", "distance": 1.0}
+    filtered = function is ops.cross_bilateral_filter
+    infinite = row("one weight infinite", guide=flat, kernel=some(torch.inf, uniform), normalize="none")
+    return checked(
+        function,
+        partial(_bilateral, filtered=filtered),
+        ordinary("5x5 taps, normals and depth", (1, 3, 1, 2), kernel_size=5, channels=(3, 1)),
+        ordinary("no guides", (1, 3, 2, 3), channels=(), distance=None),
+        ordinary("distance only", (1, 1, 3, 2), channels=()),
+        ordinary("zero falloffs", scale=0.0),
+        stiff("falloffs up to 1e3", guide=between(0, 0.1), scale=1e3),
+        stiff("f of 1e6, guides 1e-4 apart", guide=small, scale=1e6, **exact),
+        # Known to eps times the logits.
+        replace(
+            stiff("logits 1e4 and 1 apart", guide=between(-1, 1), kernel=times(1, between(-1, 1), 1e4), **exact),
+            kind="extreme",
+        ),
+        row("f of 1e8, guides 1e-4 apart", 1e8, guide=small),
+        row("f of 1e8, guides of 1e4 and 1e-4 apart", 1e8, guide=times(1, small, 1e4)),
+        row("logits to +-1e4", guide=flat, kernel=between(-1e4, 1e4)),
+        row("logits of -1e4", guide=flat, kernel=times(1, between(-1, 1), -1e4)),
+        row("one logit infinite", guide=flat, kernel=some(torch.inf)),
+        row("one logit of minus infinity", guide=flat, kernel=some(-torch.inf)),
+        row("all weights zero, as logits", guide=flat, kernel=constant(-torch.inf)),
+        row("all weights zero", guide=flat, kernel=constant(0), normalize="none"),
+        # A mean with an infinite weight is undefined.
+        *(() if filtered else (infinite,)),
+        row("Eq. 5, f of 1e8", 1e8, guide=between(-1, 1), kernel=uniform, normalize="none"),
+        row("depth 0 and 1e10", 1e8, guide=far_and_near),
+        *(row(f"normals of length 0 and {n:g}", 1e3, guide=normals(n), channels=(3,)) for n in (1, 1e3)),
+        row("64 channels", 1e3, channels=(64,)),
+        row("7x7 on 1x2", 1e3, (1, 3, 1, 2), kernel_size=7, border="zeros"),
+        row("no image", size=(0, 3, 3, 4)),
+        settings=(
+            {"normalize": "softmax", "border": "replicate"},
+            {"normalize": "none", "border": "zeros", "channels": (3,)},
+            {"normalize": "softmax", "border": "renormalize", "channels": (1, 1)},
+            {"normalize": "none", "border": "renormalize"},
+            {"normalize": "softmax", "border": "zeros", "channels": (3, 1), "distance": None},
+            {"normalize": "none", "border": "replicate", "channels": (3, 1)},
+        ),
+        sizes=SMALL,
+        limits={},
+        fireflies=stiff("fireflies", (1, 3, 2, 3), dim) if filtered else None,
+        images=_IMAGE if filtered else (),
+        weights=lambda settings: not filtered and settings.get("normalize", "softmax") == "softmax",
+        rounds=_bilateral_rounds,
+    )
+
+
 def _learned(g: Generator, size: Size, image: Draw, kernel: Draw = softmax(1, 4), side: int = 4) -> Inputs:
     batch, channels, *half = size[0], size[1], (size[2] + 1) // 2, (size[3] + 1) // 2
     return {"image": image(g, batch, channels, *half), "kernel": kernel(g, batch, side**2, *half)}
 
 
-_LEARNED = crossed(
-    learned_upsample,
+_LEARNED = checked(
+    ops.learned_upsample,
     _learned,
     extreme("no weights", kernel=constant(0), border="replicate"),
     extreme("weights that cancel", kernel=alternating(1e4), border="zeros"),
@@ -243,6 +233,7 @@ _LEARNED = crossed(
         {"border": "zeros", "side": 2},
     ),
     fireflies=stiff("fireflies, peaked weights", (1, 3, 3, 4), radiance, kernel=softmax(10, 4), border="replicate"),
+    images=_IMAGE,
 )
 
 
@@ -250,14 +241,14 @@ def _partitioned(g: Generator, size: Size, image: Draw, logits: Draw = times(2, 
     return {"image": image(g, *size), "logits": logits(g, size[0], levels, *size[2:])}
 
 
-_PARTITIONS = crossed(
-    pyramid_partition,
+_PARTITION = checked(
+    ops.pyramid_partition,
     _partitioned,
-    extreme("equal logits of 1e4", logits=constant(1e4)),
     extreme("logits of 1e4, of both signs", logits=alternating(1e4)),
     extreme("7 levels of 3x2", (1, 3, 3, 2), levels=7),
     settings=({"levels": 3}, {"levels": 2}, {"levels": 4}, {"levels": 5}, {"levels": 1}),
     fireflies=stiff("fireflies, peaked weights", (1, 3, 3, 2), radiance, logits=times(10, normal)),
+    images=_IMAGE,
 )
 
 
@@ -270,18 +261,26 @@ def _cliff(g: Generator, *shape: int) -> Tensor:
     return 0.1 * normal(g, *shape) + torch.where(torch.arange(shape[-1]) < shape[-1] // 2, -1e4, 1e4)
 
 
-_IMPORTANCES = crossed(
-    importance_filter,
+def _lost(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, float]:
+    """A weight below the smallest number of float32 may become 0; all weights add up to at least 1e-6."""
+    images = [inputs[name] for name in ("image", "previous") if name in inputs]
+    largest = max((float(image.abs().amax()) for image in images if image.numel()), default=0.0)
+    return {"result": 2 * settings.get("kernel_size", 7) ** 2 * _TINY * largest / 1e-6}
+
+
+_IMPORTANCE = checked(
+    ops.importance_filter,
     _important,
     stiff("map of zeros", importance=constant(0), kernel_size=3),
     stiff("map of about 20", (1, 2, 3, 4), importance=times(20, normal), kernel_size=5),
     extreme("map of -1e4 to 1e4", smooth=("image",), importance=between(-1e4, 1e4), kernel_size=5),
     extreme("map with a cliff of 2e4", (1, 3, 2, 8), importance=_cliff, kernel_size=3),
     *(extreme(f"map of {m:g}", importance=constant(m), kernel_size=5) for m in (-1e30, -1e4, 1e4, 1e30)),
-    extreme("window of 21", kernel_size=21),
     settings=({"kernel_size": 3}, {"kernel_size": 5}, {"kernel_size": 7}, {"kernel_size": 13}),
     # The step of finite differences is too coarse where the weights are nearly those of a maximum.
-    fireflies=stiff("fireflies", (1, 3, 3, 4), radiance, smooth=("image",), kernel_size=5),
+    fireflies=stiff("fireflies", (1, 3, 3, 4), radiance, smooth=_IMAGE, kernel_size=5),
+    images=_IMAGE,
+    rounds=_lost,
 )
 
 
@@ -307,8 +306,8 @@ def _alike(
     return inputs
 
 
-_AFFINITIES = crossed(
-    affinity_filter,
+_AFFINITY = checked(
+    ops.affinity_filter,
     _alike,
     ordinary("5x5 taps, RGB", (1, 3, 1, 3), kernel_size=5, dilation=1),
     ordinary("one tap", (1, 1, 1, 2), kernel_size=1),
@@ -316,10 +315,8 @@ _AFFINITIES = crossed(
     # Central differences would need a negative weight, which is clamped.
     extreme("no weight of the centre", (1, 1, 1, 3), normal, ("image", "features", "bandwidth"), center=constant(0)),
     extreme("unknown history", weight=some(0.0, between(0.1, 1)), before=True, kernel_size=3),
-    extreme("7x7 taps", before=True, kernel_size=7),
     extreme("taps 64 pixels apart", dilation=64, kernel_size=3),
     *(extreme(f"features of {n:g}", features=alternating(n), kernel_size=3) for n in (1e-30, 6e4, 1e18, 1e30)),
-    extreme("equal features", features=constant(0.3), bandwidth=constant(1e6), kernel_size=3),
     *(
         extreme(f"bandwidths of {n:g}", features=normal, bandwidth=constant(n), before=True, kernel_size=3)
         for n in (0, 1e6)
@@ -333,37 +330,19 @@ _AFFINITIES = crossed(
     ),
     sizes=SMALL,
     fireflies=stiff("fireflies", (1, 1, 2, 2), dim, kernel_size=3),
+    images=("image", "previous"),
+    rounds=_lost,
 )
 
 
-def _lost(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, float]:
-    """A weight below the smallest number of float32 may become 0; all weights add up to at least 1e-6."""
-    images = [inputs[name] for name in ("image", "previous") if name in inputs]
-    largest = max((float(image.abs().amax()) for image in images if image.numel()), default=0.0)
-    return {"result": 2 * settings.get("kernel_size", 7) ** 2 * _TINY * largest / 1e-6}
-
-
-_IMAGE = ("image",)
-FILTERS = (
-    Op(kernel_conv, _filters(kernel_conv), KernelConv, images=_IMAGE),
-    Op(kernel_splat, _filters(kernel_splat), KernelSplat, images=_IMAGE),
-    Op(softmax_splat, _SPLATS, images=_IMAGE),
-    Op(
-        cross_bilateral_weights,
-        _bilateral_cases(cross_bilateral_weights),
-        CrossBilateralWeights,
-        weights=lambda settings: bool(settings.get("normalize", "softmax") == "softmax"),
-        rounds=_bilateral_rounds,
-    ),
-    Op(
-        cross_bilateral_filter,
-        _bilateral_cases(cross_bilateral_filter),
-        CrossBilateralFilter,
-        images=_IMAGE,
-        rounds=_bilateral_rounds,
-    ),
+OPS = (
+    _filter(ops.kernel_conv),
+    _filter(ops.kernel_splat),
+    _SPLAT,
+    _weighted(ops.cross_bilateral_weights),
+    _weighted(ops.cross_bilateral_filter),
+    _PARTITION,
+    _LEARNED,
+    _IMPORTANCE,
+    _AFFINITY,
 )
-PARTITION = Op(pyramid_partition, _PARTITIONS, images=_IMAGE)
-LEARNED = Op(learned_upsample, _LEARNED, images=_IMAGE)
-IMPORTANCE = Op(importance_filter, _IMPORTANCES, ImportanceFilter, images=_IMAGE, rounds=_lost)
-AFFINITY = Op(affinity_filter, _AFFINITIES, AffinityFilter, images=("image", "previous"), rounds=_lost)

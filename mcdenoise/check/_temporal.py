@@ -9,13 +9,11 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from mcdenoise import ops
 from mcdenoise.check._pixels import seen, sky, wall
-from mcdenoise.check.case import Case, Draw, Inputs, Op, between, constant, dim, radiance, uniform
-from mcdenoise.check.regimes import SMALL, Size, crossed, extreme, ordinary, stiff
-from mcdenoise.ops.gradients import TemporalGradient, temporal_gradient
-from mcdenoise.ops.lag import HistoryLag, history_lag
-from mcdenoise.ops.resampling import resample
-from mcdenoise.ops.temporal import Accumulate, Surface, accumulate, motion_from_position, reproject
+from mcdenoise.check.case import Draw, Inputs, Op, between, constant, dim, radiance, uniform
+from mcdenoise.check.regimes import SMALL, Size, checked, extreme, ordinary, stiff
+from mcdenoise.ops import Surface
 
 
 def _lagging(
@@ -33,11 +31,10 @@ def _lagging(
 
 
 # Settings for which differences are 1 to 2 times the threshold, so that the result is neither 0 nor 1.
-_LAGS = crossed(
-    history_lag,
+_LAG = checked(
+    ops.history_lag,
     _lagging,
     ordinary("no change", (1, 3, 4, 5), between(0.8, 1), change=1.0),
-    ordinary("darker by half", (1, 3, 4, 5), between(0.8, 1), change=0.5, threshold=4.0),
     # Without noise only the smallest visible difference counts; its square is smaller than the step of finite
     # differences in the variance.
     stiff("no noise", (1, 1, 1, 1), constant(0.9), ("history", "recent"), change=1.0045, noise=0.0, threshold=3.0),
@@ -45,7 +42,6 @@ _LAGS = crossed(
     extreme("the light goes on", (1, 3, 5, 6), constant(0), recent=between(0.5, 1)),
     extreme("the light goes on at 1e30", (1, 3, 5, 6), constant(0), recent=constant(1e30)),
     extreme("1e30 and 1e-30", (1, 3, 5, 6), constant(1e30), recent=constant(1e-30)),
-    extreme("radiance without noise", (1, 3, 5, 6), noise=0.0),
     extreme("noise of 1e15 times the light", (1, 3, 5, 6), constant(1), recent=constant(2), noise=1e15),
     settings=(
         {"threshold": 5.5, "kernel_size": 5},
@@ -84,7 +80,21 @@ def _one_sample(drawn: dict[str, Any]) -> None:
     drawn["weight"][..., :3, :3] = 0
 
 
-def _gradients() -> tuple[Case, ...]:
+def _gradient_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
+    """Relative to the maximum luminance, values below the smallest number of float32 become 0."""
+    if not inputs["current"].numel():
+        return {}
+    limits = torch.finfo(torch.float32)
+    largest = max(float(inputs[name].abs().max()) for name in ("current", "previous"))
+    powers = {"current": 1, "previous": 1, "variance": 2}
+    return {
+        name: inputs[name].abs().clamp_min(limits.tiny / limits.eps * largest**power)
+        for name, power in powers.items()
+        if name in inputs
+    }
+
+
+def _gradient() -> Op:
     both, lit = ("current", "previous"), between(0.1, 1.1)
     noisy = (*both, "variance")
 
@@ -94,14 +104,13 @@ def _gradients() -> tuple[Case, ...]:
     def still(drawn: dict[str, Any]) -> None:
         drawn["current"] = drawn["previous"].clone()
 
-    return crossed(
-        temporal_gradient,
+    return checked(
+        ops.temporal_gradient,
         _changing,
         ordinary("luminance alone", (1, 1, 5, 7), lit, inputs=both, levels=2),
         ordinary("strata of a pixel, normals", (1, 1, 2, 3), lit, inputs=(*both, "normal"), stratum=1, levels=3),
         ordinary("one row, depths", (1, 1, 1, 7), lit, inputs=(*noisy, "depth"), sigma_z=3.0, levels=2),
         ordinary("no filter", (1, 1, 4, 4), lit, inputs=(*noisy, "weight"), levels=0, threshold=1.0),
-        ordinary("brighter", (1, 1, 3, 4), lit, inputs=noisy, change=2.0, levels=2),
         stiff("nearly all noise", (1, 1, 4, 4), lit, both, inputs=noisy, noise=0.6, levels=2),
         # Central differences would need a negative weight.
         extreme("one sample a stratum", (1, 1, 5, 7), lit, both, inputs=(*both, "weight"), alter=_one_sample, levels=1),
@@ -117,21 +126,8 @@ def _gradients() -> tuple[Case, ...]:
         sizes=SMALL,
         image=lit,
         fireflies=stiff("fireflies", (1, 1, 3, 4), dim, ("weight", "normal", "depth"), stratum=2, levels=2),
+        rounds=_gradient_rounds,
     )
-
-
-def _gradient_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
-    """Relative to the maximum luminance, values below the smallest number of float32 become 0."""
-    if not inputs["current"].numel():
-        return {}
-    limits = torch.finfo(torch.float32)
-    largest = max(float(inputs[name].abs().max()) for name in ("current", "previous"))
-    powers = {"current": 1, "previous": 1, "variance": 2}
-    return {
-        name: inputs[name].abs().clamp_min(limits.tiny / limits.eps * largest**power)
-        for name, power in powers.items()
-        if name in inputs
-    }
 
 
 def _camera(batch: int, eye_z: float, unit: float, w: float) -> Tensor:
@@ -163,8 +159,14 @@ def _projected(
     return {"position": position, "previous_view_projection": _camera(batch, eye_z, unit, w)}
 
 
-_MOTIONS = crossed(
-    motion_from_position,
+def motion_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor | float]:
+    """A place is rounded as a number up to the image's size, and with it all that is derived from it."""
+    size = float(max(inputs["position" if "position" in inputs else "motion"].shape[-2:]))
+    return {"motion": inputs["motion"].abs() + size} if "motion" in inputs else {"result": size}
+
+
+_MOTION = checked(
+    ops.motion_from_position,
     _projected,
     ordinary("5x7", (1, 3, 5, 7)),
     # The previous camera was at z = 3.5, and the points are at z = 2 to 5, some of them close to its plane.
@@ -176,17 +178,14 @@ _MOTIONS = crossed(
     extreme("behind the camera", scale=-1.0),
     # Points near the plane of the camera have very large motion.
     *(extreme(f"w of {w:g}", w=w) for w in (1e-15, 1e15)),
-    extreme("one row of 9", (1, 3, 1, 9)),
     extreme("no image", (0, 3, 3, 4)),
-    images={},
+    limits={},
     fireflies=None,
+    least_dtype=torch.float32,
+    rounds=motion_rounds,
+    # Behind the camera, motion is infinite.
+    finite=False,
 )
-
-
-def motion_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor | float]:
-    """A place is rounded as a number up to the image's size, and with it all that is derived from it."""
-    size = float(max(inputs["position" if "position" in inputs else "motion"].shape[-2:]))
-    return {"motion": inputs["motion"].abs() + size} if "motion" in inputs else {"result": size}
 
 
 def _resample_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor | float]:
@@ -262,17 +261,19 @@ _MOTION_ROWS = (
     extreme("motion unknown", (1, 1, 2, 4), uniform, ("previous", "motion"), change=_unknown),
     *(extreme(f"motion {m:g}", change=_move(m)) for m in (1e-30, 1e30, torch.inf, -torch.inf, torch.nan)),
 )
-_RESAMPLED = crossed(
-    resample,
+_RESAMPLED = checked(
+    ops.resample,
     _resampled,
     *_MOTION_ROWS,
     image=uniform,
     fireflies=stiff("fireflies", (1, 3, 4, 5), radiance),
+    images=("previous",),
+    rounds=_resample_rounds,
 )
 
 
-def _histories(function: Any) -> tuple[Case, ...]:
-    accumulating = function is accumulate
+def _history(function: Any) -> Op:
+    accumulating = function is ops.accumulate
 
     def build(
         g: Generator,
@@ -318,7 +319,7 @@ def _histories(function: Any) -> tuple[Case, ...]:
     def lasting(draw: Draw, **given: Any) -> dict[str, Any]:
         return {"length": draw, **({"alpha_min": 0.1} | given if accumulating else {})}
 
-    return crossed(
+    return checked(
         function,
         build,
         ordinary("relative, all buffers, batch of 2, RGB", (2, 3, 2, 3), uniform, **only),
@@ -327,7 +328,6 @@ def _histories(function: Any) -> tuple[Case, ...]:
         ),
         ordinary("relative, normal", (1, 1, 3, 3), uniform, buffers=("normal",), normal_limit=0.3),
         ordinary("relative, all buffers, labels", (1, 3, 3, 3), uniform, buffers=(*all_buffers, "label")),
-        ordinary("labels", (1, 1, 3, 4), uniform, buffers=("label",)),
         ordinary("bmfr", (1, 3, 3, 3), uniform, but_length, length=between(1, 3.4), **bmfr),
         ordinary("long history", (1, 1, 3, 3), uniform, **lasting(between(12, 40))),
         replace(still, smooth=smooth("color", "previous", "previous_length"), given={**still.given, **only}),
@@ -345,15 +345,9 @@ def _histories(function: Any) -> tuple[Case, ...]:
         image=uniform,
         smooth=everything,
         fireflies=stiff("fireflies", (1, 3, 2, 3), radiance, everything, **only),
+        images=("color", "previous") if accumulating else ("previous",),
+        rounds=motion_rounds,
     )
 
 
-LAG = Op(history_lag, _LAGS, HistoryLag)
-GRADIENT = Op(temporal_gradient, _gradients(), TemporalGradient, rounds=_gradient_rounds)
-HISTORY = (
-    # Behind the camera, motion is infinite.
-    Op(motion_from_position, _MOTIONS, least_dtype=torch.float32, rounds=motion_rounds, finite=False),
-    Op(reproject, _histories(reproject), images=("previous",), rounds=motion_rounds),
-    Op(resample, _RESAMPLED, images=("previous",), rounds=_resample_rounds),
-    Op(accumulate, _histories(accumulate), Accumulate, images=("color", "previous"), rounds=motion_rounds),
-)
+OPS = (_LAG, _gradient(), _MOTION, _history(ops.reproject), _RESAMPLED, _history(ops.accumulate))

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import torch
 from torch import Generator, Tensor, nn
 
-from mcdenoise.ops.temporal import Surface
+from mcdenoise import ops
+from mcdenoise.ops import Surface
 
 Kind = Literal["ordinary", "stiff", "extreme"]
 Value = Tensor | list[Tensor] | Surface | None
@@ -68,7 +69,6 @@ class Op:
     Args:
         function: the public function. In float64 it is the reference of all other dtypes and backends.
         cases: at least four cases, including ordinary ones.
-        module: the Module twin, if there is one.
         least_dtype: minimum precision of the results; by default they have the dtype of the inputs.
         images: the arguments that are images in the same unit: the first result scales with them, and is constant if
             they are constant and the weights sum to one.
@@ -88,7 +88,6 @@ class Op:
 
     function: Callable[..., Any]
     cases: tuple[Case, ...]
-    module: type[nn.Module] | None = None
     least_dtype: torch.dtype | None = None
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
@@ -102,6 +101,12 @@ class Op:
     def name(self) -> str:
         """The function's name."""
         return self.function.__name__
+
+    @property
+    def module(self) -> type[nn.Module] | None:
+        """The Module twin, if there is one."""
+        found: type[nn.Module] | None = getattr(ops, self.name.title().replace("_", ""), None)
+        return found
 
 
 def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:

@@ -16,20 +16,4 @@ from mcdenoise.check.case import Case, Inputs, Kind, Op, map_tensors
 
 __all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
 
-OPS: tuple[Op, ...] = (
-    *_spatial.FILTERS,
-    *_pixels.RESOLUTIONS,
-    _spatial.PARTITION,
-    _spatial.LEARNED,
-    *_pixels.ALBEDO,
-    *_pixels.GRID,
-    _pixels.FIREFLIES,
-    _temporal.LAG,
-    _spatial.IMPORTANCE,
-    _pixels.ATROUS,
-    _spatial.AFFINITY,
-    *_pixels.MOMENTS,
-    _temporal.GRADIENT,
-    _pixels.REGRESSION,
-    *_temporal.HISTORY,
-)
+OPS: tuple[Op, ...] = (*_spatial.OPS, *_pixels.OPS, *_temporal.OPS)

@@ -1,7 +1,7 @@
 """Regimes of inputs, by which every op is tried: ordinary sizes, fireflies, and the ends of what an image may hold.
 
 An op has a builder, ``build(g, size, image, **given)``, which draws its arguments for an image of that size from the
-generator ``g``; ``image`` draws what is radiance. :func:`crossed` gives the op all regimes, and rows of its own, in
+generator ``g``; ``image`` draws what is radiance. :func:`checked` gives the op all regimes, and rows of its own, in
 which other arguments are special.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 from torch import Generator, Tensor
 
-from mcdenoise.check.case import Case, Draw, Inputs, Kind, alternating, constant, dim, normal, radiance, uniform
+from mcdenoise.check.case import Case, Draw, Inputs, Kind, Op, alternating, constant, dim, normal, radiance, uniform
 
 Size = tuple[int, int, int, int]
 Builder = Callable[..., Inputs]
@@ -99,18 +99,19 @@ extreme = _rows("extreme", (1, 3, 2, 4), radiance, ())
 FIREFLIES = stiff("fireflies", (1, 3, 2, 3), dim)
 
 
-def crossed(
+def checked(
     function: Callable[..., Any],
     build: Builder,
     *rows: Row,
     settings: Sequence[Mapping[str, Any]] = ({},),
     sizes: Mapping[str, Size] = ORDINARY,
     image: Draw = normal,
-    images: Mapping[str, Draw] = IMAGES,
+    limits: Mapping[str, Draw] = IMAGES,
     fireflies: Row | None = FIREFLIES,
     smooth: tuple[str, ...] | None = None,
-) -> tuple[Case, ...]:
-    """The cases of an op: all regimes, in turn with some settings, and rows of its own.
+    **properties: Any,
+) -> Op:
+    """An op with its cases: all regimes, in turn with some settings, and rows of its own.
 
     Args:
         function: the op.
@@ -119,9 +120,10 @@ def crossed(
         settings: of the op, and arguments of the builder; ordinary and extreme regimes take them in turn.
         sizes: of the ordinary regimes.
         image: of the ordinary regimes.
-        images: of the extreme regimes; there are none for an op without one.
+        limits: images of the extreme regimes; there are none for an op without one.
         fireflies: the regime of fireflies.
         smooth: of the ordinary regimes.
+        properties: the others of the :class:`Op`.
     """
     usual = [
         Row(_named(name, given), "ordinary", size, image, smooth, given)
@@ -129,14 +131,14 @@ def crossed(
             cycle(sizes.items()), cycle(settings), range(max(len(sizes), len(settings))), strict=False
         )
     ]
-    tried = [(name, (1, 3, 2, 4), draw) for name, draw in images.items()]
-    tried += [(f"{name}, six decades", size, radiance) for name, size in SIZES.items() if images]
-    limits = [
+    tried = [(name, (1, 3, 2, 4), draw) for name, draw in limits.items()]
+    tried += [(f"{name}, six decades", size, radiance) for name, size in SIZES.items() if limits]
+    extremes = [
         Row(_named(name, given), "extreme", size, draw, (), given)
         for (name, size, draw), given in zip(tried, cycle(settings), strict=False)
     ]
     bright = [] if fireflies is None else [fireflies]
-    return tuple(_case(function, build, row) for row in (*usual, *bright, *rows, *limits))
+    return Op(function, tuple(_case(function, build, row) for row in (*usual, *bright, *rows, *extremes)), **properties)
 
 
 def _named(name: str, given: Mapping[str, Any]) -> str:

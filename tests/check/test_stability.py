@@ -48,8 +48,8 @@ SLOW = ("affinity_filter", "atrous", "moments_variance", "temporal_gradient")
     ids=lambda op: op.name,
 )
 def test_every_op_is_stable(op: Op) -> None:
-    # Of the ordinary cases, every third: in float64 all of them equal their equation.
-    cases = tuple(case for i, case in enumerate(op.cases) if i % 3 == 0 or case.kind != "ordinary")
+    # In float64 all of them equal their equation, and the command has them all.
+    cases = op.cases[::2]
     checks = list(check_op(replace(op, cases=cases), (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
     for what in ("forward", "gradient"):
