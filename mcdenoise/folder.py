@@ -401,7 +401,6 @@ def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> 
                 "reset": done.reset,
                 "history": done.history,
                 "replaced_pixels": done.replaced_pixels,
-                "fireflies": done.fireflies,
                 "negative_light": done.repairs.negative,
                 "light_gained": done.repairs.gained,
                 "missing": done.missing,

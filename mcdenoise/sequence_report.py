@@ -8,9 +8,6 @@ from typing import Any
 
 from mcdenoise.models import FrameReport, Stage, summarize
 
-# Fraction of the light from which clamped fireflies are told.
-_TOLD = 0.01
-
 
 @dataclass
 class SequenceReport:
@@ -59,16 +56,6 @@ class SequenceReport:
         """For each stage, whether it was computed, how much of it was skipped, and why, see :func:`summarize`."""
         read = Stage("read", 0.0, self.reading)
         return summarize([[read, *report.stages.values()] for report in self.frames.values()])
-
-    @property
-    def clamped(self) -> str:
-        """How much light was clamped as fireflies, in words; empty if that is at most a hundredth in every frame."""
-        lost = {number: done.fireflies for number, done in self.frames.items()}
-        most = max(lost, key=lost.__getitem__, default=None)
-        if most is None or lost[most] <= _TOLD:
-            return ""
-        mean = sum(lost.values()) / len(lost)
-        return f"clamped fireflies: {mean:.1%} of the light, at most {lost[most]:.1%} of a frame's (frame {most})"
 
     @property
     def warnings(self) -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
-from commands import succeeds
 from refusals import refused
 from small import small_model
 from torch import Tensor, nn
@@ -209,27 +208,6 @@ def test_an_old_report_does_not_survive_a_run_that_fails(small_sequence: Path, t
 
 
 # Skipped work
-
-
-def test_clamped_light_is_told(tmp_path: Path) -> None:
-    """On the screen, in denoise.json and in the report of a film: how much, at most, and in which frame."""
-    (tmp_path / "in").mkdir()
-    noise = np.random.default_rng(0).gamma(2.0, 0.5, (2, 48, 64, 1)) * np.ones(3)
-    noise[1, 20, 30] = 1e4
-    for number, color in enumerate(noise, 1):
-        write_exr(tmp_path / "in" / f"shot_{number}.exr", color.astype(np.float32), "RGB")
-    printed = succeeds("denoise", tmp_path / "in", "-o", tmp_path / "out", "--model", "oidn_tuned_small")
-    frames = json.loads((tmp_path / "out" / "denoise.json").read_text())["frames"]
-    told = [line for line in printed.splitlines() if "fireflies" in line]
-    # The pixel has 1e4 of the light of 3072 + 1e4 pixels, of which thirty times the mean is left.
-    assert frames["1"]["fireflies"] == 0
-    assert frames["2"]["fireflies"] == pytest.approx(1e4 / (1e4 + 3072), rel=0.02)
-    for fact in (f"{frames['2']['fireflies'] / 2:.1%}", f"{frames['2']['fireflies']:.1%}", "frame 2"):
-        assert fact in told[0]
-    (tmp_path / "film.toml").write_text('[[shot]]\nname = "a"\ninput = "in"\nmodel = "oidn_tuned_small"\n')
-    succeeds("film", tmp_path / "film.toml", "-o", tmp_path / "film", "--workers", "1")
-    (shot,) = json.loads((tmp_path / "film" / "film.json").read_text())["shots"]
-    assert told[0] in shot["warnings"]
 
 
 @pytest.mark.parametrize(

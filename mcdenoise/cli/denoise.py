@@ -137,8 +137,6 @@ def _denoise(
             preview.close(on_frame=lambda: progress.advance(task))
     for row in report.plan:
         say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
-    if report.clamped:
-        print(report.clamped)
     if report.replaced_pixels:
         print(f"replaced {report.replaced_pixels} NaN, infinite, negative or absurdly bright pixels of the noisy color")
     print(f"  tiles: {report.tiles}")

@@ -75,7 +75,7 @@ def summarize(order: Order) -> Summary:
     numbers = dict.fromkeys([row["number"] for row in worst] + [records[step].number for step in steps])
     pictures = _pictures(order, [found[number] for number in numbers])
     worst = [{**row, "picture": pictures.pop(row["number"])} for row in worst if row["number"] in pictures]
-    warnings += [*report.warnings, *filter(None, [report.clamped])]
+    warnings += report.warnings
     strip = tuple(sorted(pictures.items()))
     return Summary(report.milliseconds, tuple(rows), tuple(worst), strip, tuple(warnings), unfinished)
 

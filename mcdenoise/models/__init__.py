@@ -30,7 +30,6 @@ from mcdenoise.models._weights import (
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
-from mcdenoise.models.clamped import Clamped
 from mcdenoise.models.coarse_to_fine import CoarseToFine
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
@@ -53,7 +52,6 @@ __all__ = [
     "TOLERANCE",
     "Accumulated",
     "Chain",
-    "Clamped",
     "CoarseToFine",
     "Demodulated",
     "Exposed",

@@ -91,12 +91,6 @@ def with_light(color: Tensor, before: Tensor, after: Tensor) -> Tensor:
     return (color * factor).to(color.dtype)
 
 
-def clamped_fraction(light: Tensor, clamped: Tensor) -> Tensor:
-    """``(B,)`` fraction of the light of each image that clamping takes; both are ``(B, 3, H, W)``."""
-    before, after = (image.detach().mean((1, 2, 3)) for image in (light, clamped))
-    return torch.where(before > 0, (before - after) / torch.where(before > 0, before, 1), 0)
-
-
 def light_of_fireflies(color: Tensor) -> Tensor:
     """Fraction of the light of the median 32x32 block that clamping takes.
 

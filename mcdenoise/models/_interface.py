@@ -22,7 +22,7 @@ class Note(NamedTuple):
 
     Args:
         name: of the stage, such as ``reproject``; or ``history`` with the fraction of the pixels that have one, and why
-            there is none; or ``fireflies`` with the fraction of the light that was clamped.
+            there is none.
         reason: why it was skipped, or why it was not.
         skipped: fraction of the stage that was skipped. A tensor of one number is read when the report is, so that the
             host does not wait for a GPU.

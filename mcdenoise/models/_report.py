@@ -50,7 +50,6 @@ class FrameReport:
         reset: why the history was discarded; empty if it was used.
         tiles: how the image was divided into tiles, and why.
         history: fraction of the pixels that have a history; ``None`` if no history was looked up.
-        fireflies: fraction of the light that was clamped in fireflies.
         precision: the reason for the precision of the convolutions.
         model: the model that the first frame has picked, and why; empty if it was named.
         repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
@@ -64,7 +63,6 @@ class FrameReport:
     reset: str = ""
     tiles: str = ""
     history: float | None = None
-    fireflies: float = 0.0
     precision: str = ""
     model: str = ""
     repairs: Repairs = field(default_factory=Repairs)
@@ -97,7 +95,6 @@ class FrameReport:
             "skipped": ", ".join(skipped),
             "missing": ", ".join(self.missing),
             "replaced pixels": str(self.replaced_pixels or ""),
-            "fireflies": f"{self.fireflies:.2%} of the light clamped" if self.fireflies > 0 else "",
             "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
             "tiles": self.tiles,
             "precision": self.precision,
@@ -112,7 +109,7 @@ class FrameReport:
             if not figures:
                 self._write(note, float(note.skipped), note.value)
                 continue
-            if note.name not in ("history", "fireflies"):
+            if note.name != "history":
                 # Stages are in the order of the notes, also where their figures come later.
                 self._write(note, 0.0, None)
 
@@ -127,8 +124,6 @@ class FrameReport:
         reason = note.reason if skipped or note.otherwise is None else note.otherwise
         if note.name == "history":
             self.reset, self.history = reason, self.history if value is None else value
-        elif note.name == "fireflies":
-            self.fireflies = max(self.fireflies, value)
         else:
             self.stages[note.name] = Stage(note.name, skipped, reason, note.exact)
 

@@ -6,8 +6,8 @@ the previous result, reprojected, and predict for every pixel which of four imag
 previous result in both forms of :class:`mcdenoise.models.Recurrent`; and the noisy pixels, which are right where there
 is no noise. Training on two renderers, with noisy and with exact features and 1 to 64 samples, replaces the settings.
 Since the library's own weights are better for little independent noise, the network of a frame has weights between
-these and the trained ones, according to its noise. :class:`mcdenoise.models.Clamped` around it removes fireflies, and
-:class:`mcdenoise.models.Restored` gives back the detail of nearly clean frames.
+these and the trained ones, according to its noise. :class:`mcdenoise.models.Restored` gives back the detail of nearly
+clean frames.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models.clamped import Clamped
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.tiled import Tiled
@@ -134,20 +133,18 @@ def _with_buffers(module: nn.Module) -> nn.Module:
     return module
 
 
-def _tuned(size: Size = "base", *, fraction: float | None = None, clamp: bool = True, restore: bool = True) -> Model:
+def _tuned(size: Size = "base", *, fraction: float | None = None, restore: bool = True) -> Model:
     """The network with its memory.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
         fraction: see :class:`TunedNetwork`.
-        clamp: whether :class:`mcdenoise.models.Clamped` clamps fireflies.
         restore: whether :class:`mcdenoise.models.Restored` gives back detail.
 
     Raises:
         InputError: ``fraction`` is outside [0, 1].
     """
     model: Model = Recurrent(Tiled(TunedNetwork(size, fraction)))
-    model = Clamped(model) if clamp else model
     return Restored(model) if restore else model
 
 

@@ -8,7 +8,8 @@ pixels. Every second pixel of every second row shares hardly any. So such a fram
 size, as in Zhou et al. 2020, "When AWGN-based Denoiser Meets Real Noises", AAAI (pixel-shuffle down-sampling). Put
 together they differ by a pattern of two by two pixels, which a small bilateral filter removes.
 
-Fireflies are clamped first, see :mod:`mcdenoise.models.clamped`.
+A single bright pixel is light that few paths have found. Clamping it would take up to a fifth of the light of a frame
+with one sample a pixel, and more error than it saves.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.clamped import without_fireflies
 from mcdenoise.models.oidn import Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.models.tiled import with_border, without_border
@@ -52,9 +52,7 @@ class WithOidn(Wrapper):
     albedo of these features; ``noisy``, the frame's radiance, for later methods of a chain; and ``centred``
     ``(B, 1, H, W)``, 1 or 0, see :func:`mcdenoise.sampling.has_centred_features`. Both images are also stages of the
     output. OIDN always takes the whole image with a mirrored border, or, if its noise is correlated
-    (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size. Fireflies are clamped for it
-    (:func:`mcdenoise.models.clamped.without_fireflies`), so that the images lack a little light in return for fewer
-    bright spots.
+    (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size.
 
     Features without noise (:func:`mcdenoise.sampling.has_exact_features`) are taken as they are, which takes half the
     time and keeps textures of single pixels: ``oidn_clean`` is for them, and ``oidn_albedo`` is the frame's.
@@ -120,7 +118,7 @@ class WithOidn(Wrapper):
         oidn = self._faster()
         centred, spread = has_centred_features(frame), noise_is_spread(frame.color, frame.albedo, frame.normal)
         given = Frame(frame.color, albedo=frame.albedo, normal=frame.normal)
-        given = without_fireflies(given.map(_phases) if spread else given)
+        given = given.map(_phases) if spread else given
         # The networks take what is beyond an image as black.
         given = given.map(with_border)
         exact = centred and not has_scattered_features(frame)

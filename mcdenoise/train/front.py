@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from mcdenoise.frame import RADIANCE, Frame
-from mcdenoise.models import Accumulated, Clamped, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
@@ -115,9 +115,9 @@ def split(model: Model) -> tuple[Front, Model]:
     """Split a model into its front, which is cached, and the rest, which is trained on the cached frames.
 
     Wrappers that only skip work are dropped, because training does not skip anything; so are the one that gives back
-    what the rest smooths, because the rest should learn not to, and the one that clamps fireflies.
+    what the rest smooths, because the rest should learn not to.
     """
-    while isinstance(model, Wrapper) and type(model) in (Restored, Clamped):
+    while type(model) is Restored:
         model = model.inner
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model

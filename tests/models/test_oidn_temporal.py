@@ -95,21 +95,6 @@ def test_detail_of_a_clean_frame_is_given_back() -> None:
     assert smape_linear(restored, color) < smape_linear(without, color) / 3
 
 
-def test_fireflies_are_clamped_for_oidn() -> None:
-    frame = frame_of(40, 60, albedo=torch.full((1, 3, 40, 60), 0.5))
-    bright = frame.replace(color=frame.color.clone())
-    bright.color[..., 20, 30] *= 1e4
-    extra = WithOidn(Noisy(), threads=1, clean=False).before(bright).extra
-    # 30 times the mean of the 48 pixels around it.
-    hue = frame.color[..., 20, 30] / frame.color[..., 20, 30].mean()
-    around = frame.color[..., 17:24, 27:34].mean(1).sum() - frame.color[..., 20, 30].mean()
-    clamped = frame.color.clone()
-    clamped[..., 20, 30] = 30 * hue * around / 48
-    expected = inside(Oidn("high", threads=1).denoised(bordered(frame.replace(color=clamped)), "noisy"))
-    torch.testing.assert_close(extra[OIDN], expected)
-    assert torch.equal(extra[NOISY], bright.color)
-
-
 def test_noise_that_neighbours_share_is_removed() -> None:
     rows, columns = torch.meshgrid(torch.arange(151), torch.arange(201), indexing="ij")
     albedo = (0.2 + 0.6 * ((rows // 20 + columns // 20) % 2)).expand(1, 3, -1, -1)

@@ -16,7 +16,6 @@ from mcdenoise.frame import Frame, Hints, Skip
 from mcdenoise.models import (
     Accumulated,
     Chain,
-    Clamped,
     CoarseToFine,
     Demodulated,
     Exposed,
@@ -54,7 +53,6 @@ WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "demodulated": Demodulated,
     "exposed": Exposed,
     "accumulated": Accumulated,
-    "clamped": Clamped,
     "restored": Restored,
     "skipping": Skipping,
     "tiled": Tiled,
