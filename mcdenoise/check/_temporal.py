@@ -35,6 +35,7 @@ _LAG = checked(
     ops.history_lag,
     _lagging,
     ordinary("no change", (1, 3, 4, 5), between(0.8, 1), change=1.0),
+    ordinary("darker by half", (1, 3, 4, 5), between(0.8, 1), change=0.5, threshold=4.0),
     # Without noise only the smallest visible difference counts; its square is smaller than the step of finite
     # differences in the variance.
     stiff("no noise", (1, 1, 1, 1), constant(0.9), ("history", "recent"), change=1.0045, noise=0.0, threshold=3.0),
@@ -111,6 +112,7 @@ def _gradient() -> Op:
         ordinary("strata of a pixel, normals", (1, 1, 2, 3), lit, inputs=(*both, "normal"), stratum=1, levels=3),
         ordinary("one row, depths", (1, 1, 1, 7), lit, inputs=(*noisy, "depth"), sigma_z=3.0, levels=2),
         ordinary("no filter", (1, 1, 4, 4), lit, inputs=(*noisy, "weight"), levels=0, threshold=1.0),
+        ordinary("brighter", (1, 1, 3, 4), lit, inputs=noisy, change=2.0, levels=2),
         stiff("nearly all noise", (1, 1, 4, 4), lit, both, inputs=noisy, noise=0.6, levels=2),
         # Central differences would need a negative weight.
         extreme("one sample a stratum", (1, 1, 5, 7), lit, both, inputs=(*both, "weight"), alter=_one_sample, levels=1),
