@@ -329,6 +329,23 @@ def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
     assert "failed" in ends["ops"]
 
 
+def test_methods_are_compared_on_takes_with_clean_references(tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    generator, truth = np.random.default_rng(0), np.full((4, 3, 48, 64), 0.5, np.float32)
+    noisy = truth * generator.gamma(2.0, 0.5, truth.shape)
+    halves = truth[:2] * generator.gamma(8.0, 1 / 8, (2, *truth[:2].shape))
+    arrays = {"color": noisy, "albedo": truth, "normal": truth, "reference": halves.mean(0)}
+    (tmp_path / "takes").mkdir()
+    error = {"reference_error": (halves[0] - halves[1]) / 2}
+    write_shard(tmp_path / "takes" / "0.take.npz", {"credits": []}, arrays | error)
+    written = tmp_path / "errors.json"
+    printed = run("takes.py", tmp_path / "takes", "--clean", tmp_path / "clean", "--models", "noisy", "--json", written)
+    row = json.loads(written.read_text())["0"]
+    best = min(row[name]["smape"] for name in row if name != "noisy")
+    assert best < row["noisy"]["smape"] / 10
+    assert f"| noisy | {row['noisy']['smape'] / best:.3f} | {row['noisy']['smape'] / best:.3f} |" in printed
+
+
 @pytest.fixture
 def packed(tmp_path: Path) -> Path:
     """A folder of parts with a shot and a larger still, whose light is less noisy with a longer history."""

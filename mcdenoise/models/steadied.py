@@ -24,7 +24,7 @@ from mcdenoise.nn.oidn import oidn_exposure
 
 # Sides of the windows over which the previous result is compared with this frame, and how much a difference equal to
 # the deviation of single samples reduces the logarithm of its weight.
-_WINDOWS, _DOUBTS = (3, 15), (4.0, 12.0)
+_WINDOWS, _DOUBTS = (3, 15), (2.0, 6.0)
 # Factors of a 15x15 sum: over 3 pixels, and then over 5 such sums that are 3 pixels apart.
 _SUMS = {3: ((3, 1),), 15: ((3, 1), (5, 3))}
 _LEAST_NOISE = 0.02  # smallest deviation of single samples, relative to their mean

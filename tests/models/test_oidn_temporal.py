@@ -185,7 +185,7 @@ def test_weights_written_out_in_float64(centred: float) -> None:
         deviation = over((noisy - mean).abs(), row, column, 15).mean()
         noise = deviation / (over(mean, row, column, 15).mean() + 0.01 * inside + 1e-6) + 0.02
         n = history * same[0, 0, row, column]
-        for window, doubt in ((3, 4), (15, 12)):
+        for window, doubt in ((3, 2), (15, 6)):
             a, b, count = (
                 over(part * same[0], row, column, window) for part in (before, mean, torch.ones_like(same[0]))
             )

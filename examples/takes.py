@@ -1,0 +1,113 @@
+"""Compare methods with Open Image Denoise on packed takes whose references have been cleaned.
+
+    mcdenoise generate --takes --unseen --seeds 900000-900015 -o unseen
+    python examples/takes.py unseen --clean clean --models oidn_temporal oidn_tuned
+
+A reference of a take has 264 samples a pixel; its noise is a quarter to two thirds of the error of a good method, which
+hides what methods differ by. So ``clean`` gets copies with clean references first
+(:func:`mcdenoise.train.clean_references`). Errors are of the frames with references, the last three of a shot of 16.
+Open Image Denoise has its better setting of each take: features as noisy, or denoised first.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import torch
+
+from mcdenoise.data.files import write_json
+from mcdenoise.data.shards import Shard, find_shards, open_shard
+from mcdenoise.errors import InputError
+from mcdenoise.frame import Frame
+from mcdenoise.methods import parse_method
+from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
+from mcdenoise.models import Model, create_model
+from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.train import clean_references
+
+OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=prefiltered)")
+
+
+def made(text: str) -> Model:
+    """The method that a text names, with its shipped weights."""
+    method = parse_method(text)
+    return create_model(method.model, pretrained=method.weights is None, weights=method.weights, **method.settings)
+
+
+@torch.no_grad()
+def errors(model: Model, shard: Shard) -> dict[str, float]:
+    """Errors of a method on the frames that have references."""
+    arrays = {name: torch.from_numpy(array).float() for name, array in shard.read().items()}
+    reference = arrays.pop("reference")
+    state, images = None, []
+    for t in range(len(shard)):
+        frame, _ = Frame(**{name: array[t : t + 1] for name, array in arrays.items()}).validate()
+        output, state = model(frame, state)
+        images.append(output.image)
+    scale = oidn_exposure(reference[-1:])
+    image, reference = torch.cat(images[-len(reference) :]).clamp_min(0) * scale, reference * scale
+    found = {"smape": smape_linear(image, reference).mean(), "psnr": psnr_srgb(image, reference).mean()}
+    found["light"] = image.mean() / reference.mean()
+    if len(reference) > 1:
+        found["tsmape"] = temporal_smape_linear(image[None], reference[None]).mean()
+    return {name: round(value.item(), 5) for name, value in found.items()}
+
+
+def mean(values: Iterable[float]) -> float:
+    """The geometric mean."""
+    logs = [math.log(value) for value in values]
+    return math.exp(sum(logs) / len(logs))
+
+
+def table(rows: dict[str, dict[str, dict[str, float]]], models: list[str], moving: bool) -> Iterable[str]:
+    """Lines of a table: each method beside Open Image Denoise's better setting of each take."""
+    kept = [row for row in rows.values() if ("tsmape" in row[OIDN[0]]) == moving]
+    if not kept:
+        return
+    columns = ["SMAPE over OIDN's", "worst", "PSNR beside OIDN's", "light", "tSMAPE over OIDN's"][: 5 if moving else 4]
+    yield " | ".join([f"| {len(kept)} {'shots' if moving else 'stills'}", *columns]) + " |"
+    yield "|---" + "|--:" * len(columns) + "|"
+    for name in models:
+        ratios, changes = (
+            [row[name][key] / min(row[each][key] for each in OIDN) for row in kept if key in row[name]]
+            for key in ("smape", "tsmape")
+        )
+        ahead = [row[name]["psnr"] - max(row[each]["psnr"] for each in OIDN) for row in kept]
+        light = sum(row[name]["light"] for row in kept) / len(kept)
+        cells = [f"{mean(ratios):.3f}", f"{max(ratios):.3f}", f"{sum(ahead) / len(ahead):+.2f} dB", f"{light:.3f}"]
+        yield " | ".join([f"| {name}", *cells, *([f"{mean(changes):.3f}"] if moving else [])]) + " |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
+    parser.add_argument("--clean", type=Path, metavar="FOLDER", help="for copies with clean references")
+    parser.add_argument("--models", nargs="+", default=["oidn_temporal", "oidn_tuned"], metavar="NAME")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="all errors; takes in it are not measured again")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+
+    torch.set_num_threads(options.threads)
+    models = [*OIDN, *options.models]
+    denoisers = {name: made(name) for name in models}
+    rows = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
+    for path in (path for folder in options.takes for path in find_shards(folder)):
+        shard = open_shard(clean_references(path, options.clean) if options.clean else path)
+        row = rows.setdefault(path.name.partition(".")[0], {})
+        row |= {name: errors(model, shard) for name, model in denoisers.items() if name not in row}
+        if options.json:
+            write_json(options.json, rows)
+        print(path.name, {name: row[name]["smape"] for name in models}, flush=True)
+    for moving in (True, False):
+        print(*table(rows, models, moving), sep="\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
