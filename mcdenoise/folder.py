@@ -24,7 +24,7 @@ from mcdenoise.data.files import check_writable, make_folder, remove, write_json
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame
+from mcdenoise.frame import Frame, tells_motion
 from mcdenoise.models import FrameReport, Output, Skipping, parts_of
 from mcdenoise.sequence_report import SequenceReport
 
@@ -167,7 +167,8 @@ def write_frames(
                 on_output(frame, output)
                 output = output._replace(stages={})
             seen, before = _thumbnail(frame), seen
-            if not denoiser.report.repeats and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
+            follows = tells_motion(frame.buffers) and not denoiser.report.repeats
+            if follows and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
                 report.alike.append(number)
             del frame
             start = time.perf_counter()

@@ -145,6 +145,9 @@ def split_methods(text: str) -> list[str]:
 
 
 def _value(text: str) -> Any:
+    if text.lower() in ("true", "false"):
+        # As recipes spell it. The text 'false' would count as true.
+        return text.lower() == "true"
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):

@@ -80,6 +80,7 @@ def test_the_layers_of_a_file_are_kept(buffers: dict[str, NDArray[Any]], tmp_pat
         (("x.pfm", "--albedo", "none.pfm", "-o", "out.pfm"), "none.pfm"),
         (("x.pfm", "--preview", "-o", "out.pfm"), "found --preview"),
         (("shot_#.pfm", "-o", "out.pfm"), "found 2 frames"),
+        (("x.pfm", "-o", "out.JPG"), "found '.JPG'"),
     ],
 )
 def test_what_cannot_be_one_file_is_refused(
@@ -93,7 +94,7 @@ def test_what_cannot_be_one_file_is_refused(
     for number in (1, 2):
         write_radiance(Path(f"shot_{number}.pfm"), buffers["x"])
     assert expected in refuses("denoise", *arguments, "--model", "noisy")
-    assert not Path("out.pfm").exists()
+    assert not any(Path(name).exists() for name in ("out.pfm", "out.JPG"))
     np.testing.assert_array_equal(read(Path("x.pfm")), buffers["x"])
 
 
@@ -110,3 +111,22 @@ def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]],
         assert strict["mean"]["SMAPE"] == pytest.approx(smape, rel=1e-2)
         assert len(strict["frames"]) == (2 if where == ("a", "b") else 1)
     assert "2 frames" in refuses("evaluate", tmp_path / "a", tmp_path / "b" / "b1.exr")
+
+
+def test_pictures_without_features_are_stills_and_no_broken_shot(
+    buffers: dict[str, NDArray[Any]], tmp_path: Path
+) -> None:
+    """Nothing is said about a history where there is no motion to look one up by."""
+    for number in (1, 2, 3):
+        write_radiance(tmp_path / f"shot_{number}.pfm", buffers["x"] * (1 + number / 8))
+    out = tmp_path / "out"
+    assert "history" not in succeeds("denoise", tmp_path / "shot_#.pfm", "-o", out, "--model", "oidn_tuned_small")
+    written = json.loads((out / "denoise.json").read_text())
+    assert {frame["reset"] for frame in written["frames"].values()} == {"no motion"}
+    assert written["warnings"] == []
+
+
+def test_folders_in_a_folder_without_images_are_named(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    for name in ("beauty", "albedo"):
+        (tmp_path / "passes" / name).mkdir(parents=True)
+    assert "albedo/, beauty/" in refuses("denoise", tmp_path / "passes", "-o", tmp_path / "out")

@@ -32,6 +32,8 @@ from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import pretrained_models
 from mcdenoise.shot import ShotSettings
 
+# Formats in which nothing is written: such a name is meant as that of a file, and would become a folder's.
+_NOT_WRITTEN = {".jpg", ".jpeg", ".bmp", ".tga", ".gif", ".webp", ".jp2", ".dpx", ".psd", ".mp4", ".mov"}
 # Loading numba takes 0.9 s, which is what the shipped networks gain from it on a still of three million pixels.
 _SMALL_STILL = 1920 * 1080
 
@@ -59,6 +61,9 @@ def denoise(
         json: write the run times to this file too.
     """
     shot.check()
+    if out.suffix.lower() in _NOT_WRITTEN and not os.path.isdir(out):
+        formats = f"a folder, or a file of {', '.join(FORMATS)}"
+        raise InputError(f"{out}: expected {formats}, found '{out.suffix}'; choose one of these")
     # Otherwise memory that is freed after opening the frames would count as memory in use.
     (keep_heap if shot.max_memory is None else return_heap)()
     if shot.threads is not None:
@@ -148,7 +153,8 @@ def _denoise(
         MOTION if len(opened) == 1 else set()
     )
     if missing and features:
-        say(f"without {', '.join(sorted(missing))}, with which {report.model} is better")
+        those = "it" if len(missing) == 1 else "them"
+        say(f"read without {', '.join(sorted(missing))}: {report.model} is better with {those}")
     if not features:
         # Said last but for warnings, where it is seen.
         say("NO FEATURES: turn on the passes albedo, normal and depth in the renderer; with them it is far better")

@@ -90,10 +90,11 @@ def _given(path: Path | Iterable[Path]) -> list[Path]:
 def _groups(given: Sequential[Path], where: str) -> tuple[list[FileGroup], str]:
     paths = find_files(given)
     if not paths:
-        others = ", ".join(sorted({each.suffix for each in given[0].glob("*.*")})[:8]) if given[0].is_dir() else ""
+        inside = sorted(given[0].glob("*")) if given[0].is_dir() else []
+        others = sorted({f"{each.name}/" if each.is_dir() else each.suffix for each in inside} - {""})
         raise InputError(
             f"{where}: expected images that a renderer wrote ({', '.join(FORMATS)}), found "
-            f"{f'only {others}' if others else 'none'}; check the path"
+            f"{'only ' * bool(others) + (', '.join(others[:8]) or 'none')}; name the folder with the images, or several"
         )
     return group_files(paths)
 

@@ -49,15 +49,17 @@ def dtype_of(frame: Frame, model: Model | None, *, differentiable: bool) -> torc
 
 @contextmanager
 def explained(model: Model, dtype: torch.dtype) -> Iterator[None]:
-    """Add an explanation to the error of a model whose weights have a higher precision than its frame."""
+    """Add an explanation to the error of a model whose weights have another precision than its frame."""
     try:
         yield
     except RuntimeError as error:
-        if dtype == torch.float64 or torch.float64 not in _dtypes(model):
+        others = ", ".join(sorted(str(each).removeprefix("torch.") for each in _dtypes(model) - {dtype}))
+        if not others:
             raise
         raise InputError(
-            f"model: expected float32 weights for float32 frames, found float64 weights, with which it fails "
-            f"({' '.join(str(error).split())}); call its float(), or pass float64 frames with differentiable"
+            f"model: expected float32 weights for float32 frames, found {others} weights, with which it fails "
+            f"({' '.join(str(error).split())}); call its float(), or pass float64 frames, all weights being float64, "
+            "with differentiable"
         ) from error
 
 

@@ -34,7 +34,9 @@ class FromBuffers(nn.Module):
     def __init__(self, function: Any, reach: int | None = None) -> None:
         super().__init__()
         self.function = function
-        call = function.forward if isinstance(function, nn.Module) else function
+        # What torch.compile makes of a module takes anything.
+        call = getattr(function, "_orig_mod", function)
+        call = call.forward if isinstance(call, nn.Module) else call
         required: set[str] = set()
         optional: set[str] = set()
         for parameter in inspect.signature(call).parameters.values():

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from mcdenoise.buffers import BUFFERS, MATRIX
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.frame import Frame
 from mcdenoise.models._defaults import without_draws
@@ -83,6 +84,11 @@ def check_needs(needs: Needs, given: Collection[str]) -> None:
     if needs.buffers <= set(given):
         return
     absent, found = sorted(needs.buffers - set(given)), ", ".join(sorted(given))
+    if strange := [name for name in absent if name not in BUFFERS and name != MATRIX]:
+        raise MissingBufferError(
+            f"buffer '{strange[0]}': expected arguments with the names of buffers (color, albedo, normal, ...), "
+            f"found '{strange[0]}'; rename the argument, or give frames such a buffer in `extra`"
+        )
     what, it = ("buffer", "it") if len(absent) == 1 else ("buffers", "them")
     others = ", ".join(name for name, wanted in _ready().items() if wanted <= set(given))
     instead = f"a model that does without: {others}" if others else "another model, see `mcdenoise models`"

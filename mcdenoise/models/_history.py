@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame
+from mcdenoise.frame import Frame, tells_motion
 from mcdenoise.models._interface import Note, State
 from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
 from mcdenoise.models._state import own_state
@@ -63,7 +63,7 @@ def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None)
         view_projection: camera of the frame before.
     """
     if image is None:
-        return "first frame"
+        return "first frame" if tells_motion(frame.buffers) else "no motion"
     if image.shape[2:] != frame.color.shape[2:]:
         return "size change"
     return "" if has_motion(frame, view_projection) else "no motion"

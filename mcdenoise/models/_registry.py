@@ -117,6 +117,9 @@ def _build_model(name: str, settings: dict[str, Any]) -> Model:
             ) from error
         raise InputError(f"model '{name}': {error}; it takes {', '.join(parameters) or 'no settings'}") from error
     for key, value in arguments.items() if entry.of_zoo else ():
+        # Any text counts as true.
+        if isinstance(getattr(parameters.get(key), "default", None), bool) and isinstance(value, str):
+            raise InputError(f"model '{name}': {key}: expected True or False, found '{value}'")
         # Layers without features are possible in torch.
         if key.endswith("width") and isinstance(value, int) and value < 1:
             raise InputError(f"model '{name}': {key}: expected at least 1, found {value}")

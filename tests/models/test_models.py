@@ -21,6 +21,7 @@ from toys import one_of_each, refused, small, whole_frame
 from mcdenoise import Frame
 from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Hints, scale_samples
+from mcdenoise.methods import parse_method
 from mcdenoise.models import (
     DEFAULT,
     Accumulated,
@@ -538,6 +539,13 @@ def test_widths_without_channels_are_refused() -> None:
         for width in (-1, 0, "wide"):
             with pytest.raises(InputError, match="width"):
                 create_model(name, width=width)
+
+
+def test_a_text_is_no_truth_value() -> None:
+    message = refused(lambda: create_model("oidn_tuned", restore="false"))
+    assert "restore" in message
+    assert "'false'" in message
+    assert parse_method("mine.py:make(this=false, that=TRUE)").settings == {"this": False, "that": True}
 
 
 @pytest.mark.parametrize(

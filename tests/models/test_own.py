@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
@@ -247,3 +248,28 @@ def test_zeros_stand_for_no_history() -> None:
         assert torch.equal(output.image, again.image)
         for a, b in zip(pytree.tree_leaves(state), pytree.tree_leaves(after), strict=True):
             assert a is b is None or torch.equal(a, b)
+
+
+def test_a_compiled_module_is_a_method_as_the_module_is() -> None:
+    class Brighter(nn.Module):
+        def forward(self, color: Tensor, albedo: Tensor) -> Tensor:
+            return color + albedo
+
+    given = frame(albedo=torch.rand(1, 3, *SIZE))
+    compiled = torch.compile(Brighter(), backend="eager")
+    torch.testing.assert_close(Denoiser(compiled)(given), Denoiser(Brighter())(given))
+
+
+def test_an_argument_that_is_no_buffer_is_named() -> None:
+    message = refused(lambda: Denoiser(lambda color, x: color)(frame()))
+    assert message.startswith("buffer 'x'")
+    assert "a model that does without" not in message
+    assert Denoiser(lambda color, x: color)(frame(extra={"x": torch.ones(1, 1, *SIZE)})).shape == (1, 3, *SIZE)
+
+
+def test_weights_of_half_precision_are_named() -> None:
+    class Convolution(nn.Conv2d):
+        def forward(self, color: Tensor) -> Tensor:
+            return super().forward(color)
+
+    assert "float16 weights" in refused(lambda: Denoiser(Convolution(3, 3, 1).half())(frame()))

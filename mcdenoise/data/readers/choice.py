@@ -234,7 +234,8 @@ def _rank_by_points(choice: Choice, buffer: str, image: Image, read: Read) -> in
 
 def _twins(color: Layer, unnamed: Sequence[Layer], read: Read) -> list[Layer]:
     """Layers equal to the color: Mitsuba writes the color of a nested integrator twice."""
-    others = [layer for layer in unnamed if layer.is_color and (layer.group, layer.part) == (color.group, color.part)]
+    place = (color.group, color.part)
+    others = [each for each in unnamed if each.is_color and each != color and (each.group, each.part) == place]
     if not others:
         return []
     # Compare a few rows first, since every read decompresses all layers of these rows.

@@ -229,6 +229,13 @@ def test_the_noisy_image_is_read_and_the_clean_one_replaced(rendered: Path) -> N
     assert not asked.frame(1).color.equal(sequence.frame(1).color)
 
 
+def test_a_layer_that_is_asked_for_is_no_copy_of_itself(rendered: Path) -> None:
+    sequence = open_sequence(rendered / "blender", mapping=["color=DiffDir"])
+    (row,) = [row for row in sequence.table if row.buffer == "color"]
+    assert row.source.endswith("DiffDir.RGB")
+    assert "the same as" not in row.reading
+
+
 def test_layers_of_no_known_name_are_told_by_their_values(rendered: Path, tmp_path: Path) -> None:
     names = [f"{layer}.{each}" for layer in ("nn", "pos", "albedo") for each in ("RGB" if layer == "albedo" else "XYZ")]
     pixels = read_channels(rendered / "mitsuba" / "frame.0001.exr", {0: ["R", "G", "B", *names]})[0]
