@@ -144,6 +144,8 @@ class ShotSettings:
             InputError: see :func:`mcdenoise.data.open_sequence`; or the frames lack a requested buffer.
         """
         self.check()
+        if self.layers and not inputs:
+            raise InputError("input: expected a folder, a file or a pattern, found nothing; name it before --layers")
         stated = self.color_with_albedo if self.color_with_albedo or self.color_without_albedo else None
         opened = open_sequence(
             inputs,

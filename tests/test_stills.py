@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commands import refuses, succeeds
+from commands import refuses, run, succeeds
 from numpy.typing import NDArray
 
 from mcdenoise import denoise
@@ -130,3 +130,17 @@ def test_folders_in_a_folder_without_images_are_named(buffers: dict[str, NDArray
     for name in ("beauty", "albedo"):
         (tmp_path / "passes" / name).mkdir(parents=True)
     assert "albedo/, beauty/" in refuses("denoise", tmp_path / "passes", "-o", tmp_path / "out")
+
+
+def test_light_that_a_format_cannot_hold_is_told(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    bright = buffers["x"].copy()
+    bright[:6] = 4
+    write_radiance(tmp_path / "bright.pfm", bright)
+    for ending, told in ((".png", "25.0%"), (".tif", "25.0%"), (".exr", "")):
+        status, _, said = run("denoise", tmp_path / "bright.pfm", "-o", tmp_path / f"out{ending}", "--model", "noisy")
+        assert (status, "clamped" in said) == (0, told != "")
+        assert told in said
+
+
+def test_layers_before_the_input_are_told_from_it(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    assert "before --layers" in refuses("denoise", "-o", tmp_path / "out", "--layers", "all", tmp_path / "x.pfm")

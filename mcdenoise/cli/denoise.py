@@ -85,7 +85,9 @@ def denoise(
             written.replace(out)
         else:
             # Not what the copy of the input holds, which may have been rounded to its type.
-            write_radiance(out, images[0][0].permute(1, 2, 0).float().cpu().numpy())
+            clamped = write_radiance(out, images[0][0].permute(1, 2, 0).float().cpu().numpy())
+            if clamped:
+                warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
 
 
 def _by_buffer(
