@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import closing
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from mcdenoise.errors import InputError
 from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
@@ -51,27 +51,6 @@ class Task:
 Outcome = tuple[Any, str | None]
 # It yields tasks, which run side by side, and is sent the outcome of each.
 Job = Generator[Sequence[Task], list[Outcome], None]
-
-
-class Engine(Protocol):
-    """Runs calls in workers, which are other processes."""
-
-    @property
-    def lost(self) -> tuple[type[BaseException], ...]:
-        """What the future of a call raises if its worker was lost."""
-        ...
-
-    def slots(self) -> int:
-        """How many calls may run or wait at a time."""
-        ...
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
-        """Start a call; its result is the answer, or ``None`` and why it failed."""
-        ...
-
-    def close(self) -> None:
-        """End all workers, and what they run; a second call does nothing."""
-        ...
 
 
 def run_jobs(engine: Engine, jobs: Iterable[Job], on_wait: Callable[[], object] = lambda: None) -> None:
@@ -184,21 +163,6 @@ def parse_workers(text: str) -> int | None:
     return count
 
 
-def open_engine(workers: str, *, cpus: float = 1, gpus: float = 0) -> Engine:
-    """The engine that ``--workers`` asks for.
-
-    Args:
-        workers: number of processes of this machine, or the address of a Ray cluster.
-        cpus: see :class:`RayEngine`.
-        gpus: see :class:`RayEngine`.
-
-    Raises:
-        InputError: the number is less than 1; or see :class:`RayEngine`.
-    """
-    count = parse_workers(workers)
-    return RayEngine(workers, cpus=cpus, gpus=gpus) if count is None else LocalEngine(count)
-
-
 class LocalEngine:
     """Worker processes of this machine.
 
@@ -208,7 +172,8 @@ class LocalEngine:
         workers: number of processes, at least 1.
     """
 
-    lost = (BrokenExecutor,)
+    # What the future of a call raises if its worker was lost.
+    lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
     def __init__(self, workers: int) -> None:
         start_resource_tracker()
@@ -216,11 +181,11 @@ class LocalEngine:
         self._calls: list[Future[Outcome] | None] = [None] * workers
 
     def slots(self) -> int:
-        """See :class:`Engine`."""
+        """How many calls may run at a time."""
         return len(self._pools)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
-        """See :class:`Engine`."""
+        """Start a call in a free worker; its result is the answer, or ``None`` and why it failed."""
         free = next(place for place, call in enumerate(self._calls) if call is None or call.done())
         call = _call, version("mcdenoise"), function, *arguments
         with deaf_children():
@@ -232,7 +197,7 @@ class LocalEngine:
         return made
 
     def close(self) -> None:
-        """See :class:`Engine`."""
+        """End all workers, and what they run; a second call does nothing."""
         end_pools(self._pools)
         self._pools, self._calls = [], []
 
@@ -277,7 +242,7 @@ class RayEngine:
                 "pip install 'mcdenoise[ray]'"
             ) from error
         self._ray: Any = ray
-        self.lost = (ray.exceptions.RayError,)
+        self.lost: tuple[type[BaseException], ...] = (ray.exceptions.RayError,)
         self._begun = not ray.is_initialized()
         if self._begun:
             try:
@@ -295,7 +260,7 @@ class RayEngine:
         self._calls: dict[Future[Outcome], Any] = {}
 
     def slots(self) -> int:
-        """See :class:`Engine`: as many as the cluster can run now, and some that wait for it."""
+        """How many calls may run or wait at a time: some more than the cluster can run now."""
         resources = self._ray.cluster_resources()
         slots = resources.get("CPU", 0) / max(self._cpus, 1e-3)
         if self._gpus:
@@ -303,7 +268,7 @@ class RayEngine:
         return max(1, int(slots * 1.25) + 1)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
-        """See :class:`Engine`."""
+        """Start a call; its result is the answer, or ``None`` and why it failed."""
         call = self._call.remote(version("mcdenoise"), function, *arguments)
         self._calls = {future: each for future, each in self._calls.items() if not future.done()}
         future: Future[Outcome] = call.future()
@@ -311,7 +276,7 @@ class RayEngine:
         return future
 
     def close(self) -> None:
-        """See :class:`Engine`."""
+        """End all calls; a second one does nothing."""
         for future, call in self._calls.items():
             if not future.done():
                 self._ray.cancel(call, force=True)
@@ -319,3 +284,12 @@ class RayEngine:
         if self._begun:
             self._ray.shutdown()
             self._begun = False
+
+
+Engine: TypeAlias = LocalEngine | RayEngine
+
+
+def open_engine(workers: str, *, cpus: float = 1, gpus: float = 0) -> Engine:
+    """The engine that ``--workers`` asks for: see :func:`parse_workers` and :class:`RayEngine`."""
+    count = parse_workers(workers)
+    return RayEngine(workers, cpus=cpus, gpus=gpus) if count is None else LocalEngine(count)

@@ -18,8 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.film import work
 from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
-from mcdenoise.film.summary import Summary, summarize
-from mcdenoise.film.work import RECORDS, Found, Order
+from mcdenoise.film.work import RECORDS, Found, Order, Summary
 from mcdenoise.results import Results
 
 FILE = "film.json"
@@ -250,7 +249,7 @@ def _shot(film: Film, order: Order, result: ShotResult, on_shot: Callable[[ShotR
         outcomes = yield [Task(work.make, (order, each), _MAKE, order.made) for each in pieces]
         for piece, (failures, reason) in zip(pieces, outcomes, strict=True):
             result.failed.update(dict.fromkeys(piece.wanted, str(reason)) if failures is None else failures)
-        [(summary, result.reason)] = yield [Task(summarize, (order,), _SUMMARIZE)]
+        [(summary, result.reason)] = yield [Task(work.summarize, (order,), _SUMMARIZE)]
         if summary is None:
             break
         # Frames of a lost piece may be finished.

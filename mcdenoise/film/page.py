@@ -8,7 +8,7 @@ from typing import Any
 
 from mcdenoise.data.files import write_text
 from mcdenoise.film.driver import Film, FilmResult, ShotResult
-from mcdenoise.film.summary import Summary
+from mcdenoise.film.work import Summary
 from mcdenoise.report import render_page
 
 FILE = "film.html"

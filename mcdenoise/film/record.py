@@ -54,15 +54,37 @@ class FrameRecord:
     change: float | None = None
     at: float = field(default_factory=time.time)
 
+    def write(self, journal: BinaryIO) -> None:
+        """Add the record to a journal, which is not buffered, as one line of JSON."""
+        # A full disk may have cut off the line before; a record that is cut off is none, and its frame is made again.
+        journal.write(b"\n" + msgspec.json.encode(self) + b"\n")
 
-def stamp(path: Path) -> Stamp:
-    """The stamp of a file.
+    def is_there(self, folder: Path) -> bool:
+        """Whether its result is in the folder of the shot, as it was written."""
+        with suppress(OSError):
+            return result_stamp(folder / self.result[0])[1:] == self.result[1:]
+        return False
 
-    Raises:
-        OSError: there is no such file.
-    """
+
+def read_records(folder: Path) -> dict[int, FrameRecord]:
+    """The last record of each frame in the journals of a folder, by number."""
+    decode = msgspec.json.Decoder(FrameRecord).decode
+    found: dict[int, FrameRecord] = {}
+    for path in sorted(folder.glob("*.jsonl")):
+        with suppress(OSError):
+            for line in read_bytes(path).splitlines():
+                # Others are cut off, or damaged.
+                with suppress(ValueError, RecursionError):
+                    record = decode(line)
+                    if record.number not in found or found[record.number].at <= record.at:
+                        found[record.number] = record
+    return found
+
+
+def result_stamp(path: Path) -> Stamp:
+    """Name, size and time of a written file; an ``OSError`` if there is none."""
     status = os.stat(path)
-    return str(path), status.st_size, status.st_mtime_ns
+    return path.name, status.st_size, status.st_mtime_ns
 
 
 def stamp_and_digest(path: Path, recorded: Mapping[Stamp, str]) -> tuple[Stamp, str]:
@@ -86,11 +108,7 @@ def _digest_of(file: Stamp) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of the bytes of a file.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """SHA-256 of the bytes of a file, which must be readable."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -98,27 +116,3 @@ def digest_of(path: Path) -> str:
 def digest_text(*parts: str) -> str:
     """SHA-256 of texts."""
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def write_record(journal: BinaryIO, record: FrameRecord) -> None:
-    """Add a record to a journal, which is not buffered, as one line of JSON.
-
-    Each attempt at a piece has a journal of its own: a worker that is taken for lost may still write to its own.
-    """
-    # A full disk may have cut off the line before; a record that is cut off is none, and its frame is made again.
-    journal.write(b"\n" + msgspec.json.encode(record) + b"\n")
-
-
-def read_records(folder: Path) -> dict[int, FrameRecord]:
-    """The last record of each frame in the journals of a folder, by number."""
-    decode = msgspec.json.Decoder(FrameRecord).decode
-    found: dict[int, FrameRecord] = {}
-    for path in sorted(folder.glob("*.jsonl")):
-        with suppress(OSError):
-            for line in read_bytes(path).splitlines():
-                # Others are cut off, or damaged.
-                with suppress(ValueError, RecursionError):
-                    record = decode(line)
-                    if record.number not in found or found[record.number].at <= record.at:
-                        found[record.number] = record
-    return found

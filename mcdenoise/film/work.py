@@ -1,4 +1,4 @@
-"""The tasks of a film: scan a shot, and denoise a piece of it; `summary` has the last one.
+"""The tasks of a film: scan a shot, denoise a piece of it, and summarize it.
 
 A task depends on its arguments and on the disk alone, so that any worker can run it, and retry it. Arguments and
 answers are small: workers read and write the frames themselves.
@@ -7,26 +7,29 @@ answers are small: workers read and write the frames themselves.
 from __future__ import annotations
 
 import functools
+import os
 import secrets
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import make_folder, remove
+from mcdenoise.data.files import make_folder, remove, sweep
+from mcdenoise.data.readers.opening import open_result
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.engines import describe_error
 from mcdenoise.errors import InputError
-from mcdenoise.film.manifest import Shot
+from mcdenoise.film.manifest import PICTURES, Shot
 from mcdenoise.film.pieces import Piece, cut
 from mcdenoise.film.record import (
     FrameRecord,
@@ -34,20 +37,22 @@ from mcdenoise.film.record import (
     digest_of,
     digest_text,
     read_records,
-    stamp,
+    result_stamp,
     stamp_and_digest,
-    write_record,
 )
-from mcdenoise.folder import FrameError, check_apart, new_report, write_frames
+from mcdenoise.folder import FrameError, check_apart, new_report, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models import find_weights, frames_remembered
+from mcdenoise.preview import Preview
 
 # Folder of the records, beside the shots.
 RECORDS = ".film"
 # Settings that change no pixel of a result.
 _SILENT = {"frames", "threads", "preview", "preview_fps", "preview_exposure", "results", "max_memory"}
-# Largest side of the images whose change is measured.
-_SMALL = 64
+# Largest side of the images whose change is measured, and of a thumbnail.
+_SMALL, _THUMBNAIL = 64, 320
+# Thumbnails across the shot, and of its worst frames.
+_STRIP, _WORST = 6, 3
 
 
 @dataclass(frozen=True)
@@ -87,17 +92,6 @@ class Order:
                 count += sum(line.startswith(b"{") and line.endswith(b"\n") for line in journal)
         return count
 
-    def result(self, record: FrameRecord) -> Path:
-        """The file of a finished frame, also after the film's folder was moved."""
-        return self.folder / record.result[0]
-
-    def has(self, record: FrameRecord) -> bool:
-        """Whether that file is still as it was written."""
-        try:
-            return stamp(self.result(record))[1:] == record.result[1:]
-        except OSError:
-            return False
-
 
 @dataclass(frozen=True)
 class Found:
@@ -106,32 +100,30 @@ class Found:
     Args:
         shot: the shot, with the model that was picked, if none is named.
         numbers: numbers of all frames.
-        done: numbers of the finished frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
         overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
+        done: numbers of the finished frames.
     """
 
     shot: Shot
     numbers: tuple[int, ...]
-    done: frozenset[int]
     unreadable: Mapping[int, str]
     overlap: int | None
+    done: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A shot with its frames opened, and its denoiser."""
+    """A shot with its frames opened, its denoiser, and a digest of all settings that decide a result."""
 
-    shot: Shot
+    found: Found
     sequence: Sequence
     denoiser: Denoiser
-    overlap: int | None
-    unreadable: Mapping[int, str]
     settings: str
 
 
 class Keys:
-    """Keys of frames. Frames are asked for in ascending order, so that each file is read at most once.
+    """Keys of frames, for which each file is read at most once.
 
     A digest that is taken before the frame is read is that of the pixels, or of a file that is replaced meanwhile: then
     it is that of no file any more, and the frame is not taken for a finished one.
@@ -148,29 +140,44 @@ class Keys:
     def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
         """Stamps and digests of the files of a frame."""
         if number not in self._inputs:
-            self._inputs[number] = tuple(
-                stamp_and_digest(path, self._recorded) for path in self.opened.sequence.files(number)
-            )
+            files = self.opened.sequence.files(number)
+            self._inputs[number] = tuple(stamp_and_digest(path, self._recorded) for path in files)
         return self._inputs[number]
 
     def key(self, number: int) -> str:
-        """The key of a frame: a digest of all that decides its result."""
-        numbers, overlap = self.opened.sequence.numbers, self.opened.overlap
+        """The key of a frame: a digest of all that decides its result, with the frames in its history."""
+        numbers, overlap = self.opened.sequence.numbers, self.opened.found.overlap
         place = numbers.index(number)
-        # The frame, and the frames in its history.
         window = numbers[0 if overlap is None else max(0, place - overlap) : place + 1]
-        key = digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
-        # The next frames are added in another thread.
-        for each in [each for each in list(self._inputs) if each < window[0]]:
-            del self._inputs[each]
-        return key
+        return digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
 
     def finished(self, order: Order, numbers: Iterable[int]) -> dict[int, FrameRecord]:
         """The records of those frames that are finished: whose results, inputs and settings are still the recorded."""
         records = read_records(order.records)
         self._recorded = dict(each for record in records.values() for each in record.inputs)
-        there = [n for n in numbers if n in records and order.has(records[n])]
+        there = [n for n in numbers if n in records and records[n].is_there(order.folder)]
         return {n: records[n] for n in there if records[n].key == self.key(n)}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The summary of a shot.
+
+    Args:
+        milliseconds: median run time of each stage.
+        frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
+        worst: the rows with the highest scores, and ``picture``, the path of a thumbnail relative to the page.
+        strip: number and thumbnail of some other frames across the shot.
+        warnings: what is probably wrong, a line each.
+        unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
+    """
+
+    milliseconds: Mapping[str, float] = field(default_factory=dict)
+    frames: tuple[Mapping[str, Any], ...] = ()
+    worst: tuple[Mapping[str, Any], ...] = ()
+    strip: tuple[tuple[int, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+    unfinished: frozenset[int] = frozenset()
 
 
 def scan(order: Order) -> Found:
@@ -180,9 +187,7 @@ def scan(order: Order) -> Found:
         InputError: the shot cannot be opened, or cannot be denoised with these settings.
     """
     opened = open_order(order)
-    numbers = tuple(opened.sequence.numbers)
-    done = frozenset(Keys(opened).finished(order, numbers))
-    return Found(opened.shot, numbers, done, opened.unreadable, opened.overlap)
+    return replace(opened.found, done=frozenset(Keys(opened).finished(order, opened.found.numbers)))
 
 
 def make(order: Order, piece: Piece) -> dict[int, str]:
@@ -210,11 +215,11 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
         make_folder(order.records)
         with (order.records / f"{order.run}{secrets.token_hex(8)}.jsonl").open("ab", buffering=0) as journal:
             # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
-            for part in cut(piece.numbers, left, 0, opened.overlap):
-                numbers, keys = list(part.numbers), Keys(opened)
+            for part in cut(piece.numbers, left, 0, opened.found.overlap):
+                numbers = list(part.numbers)
                 while left & set(numbers):
                     try:
-                        _Writer(order, keys, journal, left).write(numbers)
+                        _write(order, opened, numbers, left, journal)
                     except FrameError as error:
                         numbers = [number for number in numbers if number > error.number]
                         failed |= {number: str(error) for number in left & {error.number}}
@@ -224,49 +229,103 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
     return failed
 
 
-class _Writer:
-    """Denoises frames, and records each as it is finished."""
+def _write(order: Order, opened: Opened, numbers: list[int], left: set[int], journal: BinaryIO) -> None:
+    """Denoise frames, write those that are left, and record each as it is finished, which takes it from them."""
+    settings, keys = opened.found.shot.settings, Keys(opened)
+    report = new_report(opened.sequence, "")
+    shown: Tensor | None = None
 
-    def __init__(self, order: Order, keys: Keys, journal: BinaryIO, left: set[int]) -> None:
-        self.order, self.keys, self.journal, self.left = order, keys, journal, left
-        self.opened = keys.opened
-        self.report = new_report(self.opened.sequence, "")
-        self.small: Tensor | None = None
+    def finished(number: int, image: Tensor) -> None:
+        """Called in the thread that has written the file."""
+        nonlocal shown
+        before, shown = shown, _small(image)
+        done = report.frames.pop(number)
+        if number in left:
+            stamp = result_stamp(report.files.pop(number))
+            change = None if before is None else _difference(shown, before)
+            alike = number in report.alike
+            FrameRecord(number, keys.key(number), stamp, keys.inputs(number), done, alike, change).write(journal)
+            left.discard(number)
 
-    def write(self, numbers: list[int]) -> None:
-        """Denoise frames, and write those of them that are not finished."""
-        settings, sequence = self.opened.shot.settings, self.opened.sequence
-        write_frames(
-            sequence.part(numbers),
-            self.order.folder,
-            self.opened.denoiser,
-            self.report,
-            full_float=settings.full_float,
-            output_layer=settings.output_layer,
-            unwritten=[number for number in numbers if number not in self.left],
-            of=len(sequence),
-            on_read=self.keys.inputs,
-            on_file=self.finished,
+    write_frames(
+        opened.sequence.part(numbers),
+        order.folder,
+        opened.denoiser,
+        report,
+        full_float=settings.full_float,
+        output_layer=settings.output_layer,
+        unwritten=[number for number in numbers if number not in left],
+        of=len(opened.sequence),
+        on_read=keys.inputs,
+        on_file=finished,
+    )
+
+
+def summarize(order: Order) -> Summary:
+    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview.
+
+    Raises:
+        InputError: as :func:`scan`, or something cannot be written.
+    """
+    opened = open_order(order)
+    shot, sequence = opened.found.shot, opened.sequence
+    found = Keys(opened).finished(order, sequence.numbers)
+    spelling = shot.settings.spelling
+    report = new_report(sequence, str(spelling.weights or spelling.name), shot.picked)
+    report.frames = {number: each.report for number, each in found.items()}
+    report.files = {number: order.folder / each.result[0] for number, each in found.items()}
+    report.alike = [number for number, each in found.items() if each.alike]
+    for folder in (order.folder, order.records):
+        sweep(folder, youngest=0)
+    unfinished = frozenset(sequence.numbers) - found.keys()
+    if not unfinished and not opened.found.unreadable:
+        write_report(sequence, order.folder, opened.denoiser, report)
+        if shot.settings.preview:
+            # From the files, since frames were denoised in any order.
+            shown = shot.settings.preview_in(order.folder, video=len(found) > 1)
+            for path in report.files.values():
+                shown.add(path.stem, *open_result(path).read(sequence.window))
+            shown.close()
+    warnings = [*sequence.warnings, *(report.warnings if found else [])]
+    rows = _described(found)
+    worst = sorted(rows, key=lambda row: (-row["score"], row["number"]))[:_WORST]
+    steps = np.linspace(0, len(rows) - 1, min(_STRIP, len(rows))).round().astype(int)
+    numbers = [row["number"] for row in (*worst, *(rows[step] for step in steps))]
+    pictures = _pictures(order, {number: report.files[number] for number in numbers})
+    worst = [{**row, "picture": pictures.pop(row["number"])} for row in worst if row["number"] in pictures]
+    strip = tuple(sorted(pictures.items()))
+    return Summary(report.milliseconds, tuple(rows), tuple(worst), strip, tuple(warnings), unfinished)
+
+
+def _described(records: Mapping[int, FrameRecord]) -> list[dict[str, Any]]:
+    """Rows of the page, a frame each; ``score`` is the smaller one of its changes from both neighbours."""
+    rows: list[dict[str, Any]] = []
+    for number, each in records.items():
+        sides = [records[n].change for n in (number, number + 1) if n in records]
+        rows.append(
+            {
+                "number": number,
+                "change": each.change,
+                "history": each.report.history,
+                "reset": each.report.reset,
+                "replaced_pixels": each.report.replaced_pixels,
+                "milliseconds": sum(each.report.milliseconds.values()),
+                "score": min((change for change in sides if change is not None), default=0.0),
+            }
         )
+    return rows
 
-    def finished(self, number: int, image: Tensor) -> None:
-        """Record a frame; called in the thread that has written its file."""
-        before, self.small = self.small, _small(image)
-        report = self.report.frames.pop(number)
-        if number not in self.left:
-            return
-        path = self.report.files.pop(number)
-        record = FrameRecord(
-            number,
-            self.keys.key(number),
-            (path.relative_to(self.order.folder).as_posix(), *stamp(path)[1:]),
-            self.keys.inputs(number),
-            report,
-            number in self.report.alike,
-            None if before is None else _difference(self.small, before),
-        )
-        write_record(self.journal, record)
-        self.left.discard(number)
+
+def _pictures(order: Order, files: Mapping[int, Path]) -> dict[int, str]:
+    """Write thumbnails of frames; their paths relative to the page, by number of the frame."""
+    shown = Preview(order.out / PICTURES / order.shot.name, video=False)
+    found = {}
+    for number, path in files.items():
+        with suppress(InputError):
+            image, metadata = open_result(path).read()
+            shown.add(f"{number}", _shrunk(image, _THUMBNAIL), metadata)
+            found[number] = os.path.relpath(shown.written[-1], order.out)
+    return found
 
 
 @functools.lru_cache(1)
@@ -294,7 +353,7 @@ def open_order(order: Order) -> Opened:
     )
     # After the scan the model is named, and the reason is that of the scan.
     shot = replace(order.shot, settings=settings, picked=choice or order.shot.picked)
-    return Opened(shot, sequence, denoiser, overlap, unreadable, described)
+    return Opened(Found(shot, tuple(sequence.numbers), unreadable, overlap), sequence, denoiser, described)
 
 
 @functools.lru_cache(1)
@@ -342,10 +401,14 @@ def _weights(settings: Any) -> list[str]:
 
 def _small(image: Tensor) -> Tensor:
     """A small image whose change from frame to frame is measured."""
+    return torch.log1p(_shrunk(image.detach().float(), _SMALL).clamp(0, 1e16)).cpu()
+
+
+def _shrunk(image: Tensor, side: int) -> Tensor:
+    """An image of at most this side."""
     height, width = image.shape[-2:]
-    scale = _SMALL / max(height, width, _SMALL)
-    size = (max(1, round(height * scale)), max(1, round(width * scale)))
-    return torch.log1p(F.adaptive_avg_pool2d(image.detach().float(), size).clamp(0, 1e16)).cpu()
+    scale = side / max(height, width, side)
+    return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
 
 
 def _difference(one: Tensor, other: Tensor) -> float | None:
