@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections import defaultdict
@@ -106,12 +105,12 @@ class Evaluation:
     floor: dict[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """The evaluation as JSON values; the infinite PSNR of equal images becomes ``null``."""
+        """The evaluation as JSON values, but for the PSNR of equal images, which is infinite."""
         tables = {
             name: {
                 "description": table.description,
-                "frames": {str(number): _finite(values) for number, values in table.frames.items()},
-                "mean": _finite(table.mean),
+                "frames": {str(number): values for number, values in table.frames.items()},
+                "mean": table.mean,
                 "counts": table.counts,
                 "skipped": table.skipped,
             }
@@ -124,12 +123,8 @@ class Evaluation:
             "protocols": tables,
             "warping_error": {"images": ours, "references": theirs},
             "reference_noise": self.reference_noise,
-            "perfect": _finite(self.floor),
+            "perfect": self.floor,
         }
-
-
-def _finite(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
@@ -246,33 +241,34 @@ def _evaluate(
     on_frame: Callable[[int], None],
 ) -> Evaluation:
     """Evaluate images, each with its number, frame and reference."""
-    chosen = PROTOCOLS[protocol]
-    strict = Table(PROTOCOLS[STRICT].description)
-    tables: dict[str, Table] = {STRICT: strict}
-    if protocol != STRICT:
-        tables[protocol] = Table(chosen.description)
-    pairs = _Pairs(strict)
+    tables = {name: Table(PROTOCOLS[name].description) for name in dict.fromkeys((STRICT, protocol))}
+    pairs = _Pairs(tables[STRICT])
     last: tuple[int, Tensor, Tensor] | None = None
     for number, image, frame, reference in images:
         before = last[1:] if last is not None and last[0] == number - 1 else None
-        strict.frames[number] = measure(_METRICS, image, reference, before, strict.skipped)
+        for name, table in tables.items():
+            used = sequence.numbers[PROTOCOLS[name].skipped_frames :]
+            if number in used:
+                pair = before if number - 1 in used else None
+                table.frames[number] = measure(_metrics(name), image, reference, pair, table.skipped)
         pairs.add(number, frame, image, reference, before)
-        if protocol != STRICT and number in sequence.numbers[chosen.skipped_frames :]:
-            own, first = tables[protocol], number - 1 not in sequence.numbers[chosen.skipped_frames :]
-            own.frames[number] = measure(chosen.metrics, image, reference, None if first else before, own.skipped)
         last = number, image, reference
         on_frame(number)
     pairs.finish()
-    _explain(strict, [*_temporal(_METRICS), WARPED])
-    if protocol != STRICT:
-        tables[protocol].skipped |= chosen.missing
-        if tables[protocol].frames:
-            _explain(tables[protocol], _temporal(chosen.metrics))
-        else:
-            reason = f"{protocol} skips the first {chosen.skipped_frames} frames; this sequence has no reference later"
-            tables[protocol].skipped |= dict.fromkeys(chosen.metrics, reason)
+    for name, table in tables.items():
+        reason = f"{name} skips {PROTOCOLS[name].skipped_frames} frames; this sequence has no reference after these"
+        names = [*_metrics(name)]
+        if table.frames:
+            names = [metric for metric, each in _metrics(name).items() if each.temporal] + [WARPED] * (name == STRICT)
+            reason = "no two successive frames with references"
+        missing = {metric: reason for metric in names if metric not in table.counts}
+        table.skipped = {**missing, **table.skipped, **PROTOCOLS[name].missing}
     floor = noise_floor(sequence, metrics=[name for name in USUAL if name not in ("RMSE", "FLIP")])
     return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor)
+
+
+def _metrics(protocol: ProtocolName) -> Mapping[str, Metric]:
+    return _METRICS if protocol == STRICT else PROTOCOLS[protocol].metrics
 
 
 class _Pairs:
@@ -338,18 +334,6 @@ def _is_still(motion: Tensor) -> bool:
     length = torch.hypot(motion[:, 0], motion[:, 1])
     known = length[torch.isfinite(length)]
     return known.numel() > 0 and float(known.max()) < _STILL
-
-
-def _temporal(metrics: Mapping[str, Metric]) -> list[str]:
-    return [name for name, metric in metrics.items() if metric.temporal]
-
-
-def _explain(table: Table, temporal: Iterable[str]) -> None:
-    """Add the reason for missing temporal metrics, unless there is one already."""
-    counts = table.counts
-    for name in temporal:
-        if name not in counts:
-            table.skipped.setdefault(name, "no two successive frames with references")
 
 
 def check_header(path: Path, size: tuple[int, int]) -> None:

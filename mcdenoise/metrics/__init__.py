@@ -3,10 +3,9 @@
 Images are ``(..., 3, H, W)`` scene-linear radiance; all axes before the last three are batch axes.
 """
 
-from mcdenoise.metrics._check import UncomputableError
 from mcdenoise.metrics.display import display_codes, displayed, flip_hdr, flip_srgb, psnr_gamma, psnr_srgb, ssim_srgb
 from mcdenoise.metrics.linear import relmse_linear, rmse_linear, smape_linear
-from mcdenoise.metrics.metric import Metric
+from mcdenoise.metrics.metric import Metric, UncomputableError
 from mcdenoise.metrics.protocols import PROTOCOLS, Protocol, aces_displayed, gamma_displayed
 from mcdenoise.metrics.temporal import (
     Flicker,

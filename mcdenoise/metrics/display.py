@@ -10,7 +10,7 @@ from kornia.color import linear_rgb_to_rgb
 from kornia.metrics import ssim
 from torch import Tensor
 
-from mcdenoise.metrics._check import UncomputableError, check_images
+from mcdenoise.metrics.metric import UncomputableError, check_images
 
 _SSIM_WINDOW = 11
 _LARGEST = 65504.0
@@ -62,8 +62,7 @@ def psnr_srgb(image: Tensor, reference: Tensor) -> Tensor:
         ValueError: the shapes differ.
     """
     check_images(image, reference)
-    difference = displayed(image) - displayed(reference)
-    return -10 * torch.log10(difference.square().mean((-3, -2, -1)))
+    return psnr_of(displayed(image), displayed(reference))
 
 
 def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tensor:
@@ -86,8 +85,12 @@ def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tenso
         6.0206
     """
     check_images(image, reference)
-    shown, expected = (x.clamp(0, 1).pow(1 / gamma) for x in (image, reference))
-    return -10 * torch.log10((shown - expected).square().mean((-3, -2, -1)))
+    return psnr_of(*(x.clamp(0, 1).pow(1 / gamma) for x in (image, reference)))
+
+
+def psnr_of(image: Tensor, reference: Tensor) -> Tensor:
+    """As :func:`psnr_srgb`, of images in [0, 1] that are shown as they are."""
+    return -10 * torch.log10((image - reference).square().mean((-3, -2, -1)))
 
 
 def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:

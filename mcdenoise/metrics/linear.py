@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from mcdenoise.metrics._check import check_images
+from mcdenoise.metrics.metric import check_images
 
 
 def smape_linear(image: Tensor, reference: Tensor, *, epsilon: float = 1e-2) -> Tensor:

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mcdenoise.metrics._check import UncomputableError, check_images
-from mcdenoise.metrics.display import flip, psnr_srgb, ssim_of, ssim_srgb
-from mcdenoise.metrics.metric import Metric
+from mcdenoise.metrics.display import flip, psnr_of, psnr_srgb, ssim_of, ssim_srgb
+from mcdenoise.metrics.linear import rmse_linear
+from mcdenoise.metrics.metric import Metric, UncomputableError, check_images
 
 ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
 
@@ -107,14 +107,6 @@ def _mse(image: Tensor, reference: Tensor) -> Tensor:
     return (image - reference).square().mean((-3, -2, -1))
 
 
-def _rmse(image: Tensor, reference: Tensor) -> Tensor:
-    return _mse(image, reference).sqrt()
-
-
-def _psnr(image: Tensor, reference: Tensor) -> Tensor:
-    return -10 * torch.log10(_mse(image, reference))
-
-
 def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
     """SSIM by the defaults of scikit-image before 0.20 for floats: 7x7 box, sample covariance, a data range of 2."""
     x, y = (each.reshape(-1, *each.shape[-3:]) for each in (image, reference))
@@ -165,7 +157,7 @@ def _ms_ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def _temporal_psnr(clip: Tensor, reference: Tensor) -> Tensor:
-    return _psnr(clip.diff(dim=-4), reference.diff(dim=-4)).mean(-1)
+    return psnr_of(clip.diff(dim=-4), reference.diff(dim=-4)).mean(-1)
 
 
 def _temporal_rmae(clip: Tensor, reference: Tensor) -> Tensor:
@@ -187,9 +179,9 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
         "x^0.454545, clamped to [0, 1], rounded to 8 bits; SSIM with a 7x7 box window, sample covariance and data "
         "range 2; RMSE, SMAPE (in per cent) and relMSE of the same values",
         {
-            "PSNR": Metric(_meng2020(_psnr), higher_is_better=True),
+            "PSNR": Metric(_meng2020(psnr_of), higher_is_better=True),
             "SSIM": Metric(_meng2020(_ssim_default), higher_is_better=True),
-            "RMSE": Metric(_meng2020(_rmse)),
+            "RMSE": Metric(_meng2020(rmse_linear)),
             "SMAPE": Metric(_meng2020(_smape_percent)),
             "relMSE": Metric(_meng2020(_relmse)),
         },
@@ -197,7 +189,7 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
     "fan2021": Protocol(
         "x^0.454545, clamped to [0, 1], floats; SSIM with a 7x7 box window, sample covariance and data range 2",
         {
-            "PSNR": Metric(_fan2021(_psnr), higher_is_better=True),
+            "PSNR": Metric(_fan2021(psnr_of), higher_is_better=True),
             "SSIM": Metric(_fan2021(_ssim_default), higher_is_better=True),
         },
     ),
@@ -205,7 +197,7 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
         "ACES fit, clamped to [0, 1], gamma 1/2.2, truncated to 8 bits; SSIM with an 11x11 Gaussian window and data "
         "range 1 of the luminance of x^2.2; without the first 16 frames, and with the middle 1024 of 1080 rows",
         {
-            "PSNR": Metric(_noisebase(_psnr), higher_is_better=True),
+            "PSNR": Metric(_noisebase(psnr_of), higher_is_better=True),
             "SSIM": Metric(_noisebase(_ssim_luminance), higher_is_better=True),
             "MS-SSIM": Metric(_noisebase(_ms_ssim_luminance), higher_is_better=True),
             "FLIP": Metric(_noisebase(partial(flip, dynamic_range="LDR"))),

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.metrics._check import UncomputableError, check_clip, check_images
 from mcdenoise.metrics.display import displayed
 from mcdenoise.metrics.linear import smape_linear
+from mcdenoise.metrics.metric import UncomputableError, check_clip, check_images
 from mcdenoise.ops import Surface, reproject
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear, temporal_smape_linear
-from mcdenoise.metrics._check import check_images
+from mcdenoise.metrics.metric import check_images
 from mcdenoise.models import Output
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._steps.transfer import compress
