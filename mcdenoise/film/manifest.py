@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import glob
 import os
 import tomllib
@@ -14,7 +13,7 @@ from typing import Any, get_type_hints
 import msgspec
 
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.errors import InputError, is_unicode, printable
+from mcdenoise.errors import InputError, did_you_mean, is_unicode, printable
 from mcdenoise.methods import WEIGHTS, check_names_no_code
 from mcdenoise.reading import read_text
 from mcdenoise.shot import ShotSettings
@@ -145,8 +144,7 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
         # Both spellings are accepted, that of the command line and that of Python.
         name = key.replace("-", "_")
         if name not in kinds:
-            near = difflib.get_close_matches(name, [*kinds, *_OWN], 1)
-            meant = f"did you mean '{near[0]}'?" if near else "see `mcdenoise denoise --help`"
+            meant = did_you_mean(name, [*kinds, *_OWN]) or "see `mcdenoise denoise --help`"
             raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{key}'; {meant}")
         try:
             changed[name] = _typed(kinds[name], value)

@@ -98,7 +98,7 @@ SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
         ('[[shot]]\nname = "film.json"\ninput = "b"', "not one of film.html, film.json"),
         (f'[[shot]]\nname = "{"a" * 300}"\ninput = "b"', "expected a name that a folder can have"),
         (SHOT + SHOT.replace('"a"', '"A"'), "expected a name of its own for each shot, found 'A' twice"),
-        (SHOT + "modle = 'x'", "found 'modle'; did you mean 'model'?"),
+        (SHOT + "modle = 'x'", "found 'modle'; did you mean model?"),
         (SHOT + "out = 'x'", "expected a setting of `mcdenoise denoise`, found 'out'"),
         (SHOT + "alpha_min = 'small'", "shot 1 'a', alpha_min: "),
         (SHOT + "alpha_min = 2.0", "shot 1 'a': --alpha-min: expected in (0, 1], found 2.0"),
