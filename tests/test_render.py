@@ -20,7 +20,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import FrameReport, create_model
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
-from mcdenoise.scenes.render import Camera, load_camera_path, render_sequence, view_projection
+from mcdenoise.scenes.render import Camera, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
 from mcdenoise.scenes.render.loading import LLVM, first_working
 
@@ -258,101 +258,6 @@ def test_view_projection_of_a_point_to_the_right_and_above() -> None:
     clip = np.array((1.0, 0.5, 3.0, 1.0)) @ view_projection(camera, 200, 100, near=1, far=9)
     u, v = (clip[:2] / clip[3] + 1) / 2
     np.testing.assert_allclose((u, v, clip[3]), (0.75, 0.25, 2.0))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "expected JSON"),
-        ("[]", "expected a list 'to_world'"),
-        ('{"fov": 70, "to_world": []}', "at least one camera"),
-        ('{"to_world": [[]]}', "'fov' is unusable"),
-        ('{"fov": 270, "to_world": [[]]}', "between 0 and 180"),
-        ('{"fov": 70, "to_world": [[[1, 0], [0, 1]]]}', "frame 0 is unusable: expected a finite 4x4"),
-        ('{"fov": 70, "to_world": [[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]]}', "without scaling"),
-        ('{"fov": 70, "frames": [{"position": [0, 0, 0]}]}', "frame 0 is unusable: nothing under 'look_at'"),
-        ('{"fov": 70, "frames": [{"position": [0, 0, 0], "look_at": [0, 0, 0]}]}', "frame 0 is unusable"),
-        ('{"fov": 70, "frames": [5]}', "frame 0 is unusable"),
-    ],
-)
-def test_bad_camera_paths(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "camera_path.json"
-    path.write_text(content)
-    with pytest.raises(InputError, match=message) as caught:
-        load_camera_path(path)
-    assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_camera_paths_of_both_layouts(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="No such file"):
-        load_camera_path(tmp_path / "nothing.json")
-    camera = Camera.look_at((1, 2, 3), (0, 1, 0), fov_x=65)
-    matrices, looks = tmp_path / "matrices.json", tmp_path / "looks.json"
-    matrices.write_text(json.dumps({"fov": 65, "to_world": [camera.to_world.tolist()]}))
-    looks.write_text(
-        json.dumps({"fov": 65, "frames": [{"position": [1, 2, 3], "look_at": [0, 1, 0], "up": [0, 1, 0]}]})
-    )
-    for path in (matrices, looks):
-        (found,) = load_camera_path(path).cameras
-        assert found.fov_x == 65
-        np.testing.assert_allclose(found.to_world, camera.to_world)
-    matrices.write_text(json.dumps({"fov": 90, "fov_axis": "y", "aspect": "2:1", "to_world": [np.eye(4).tolist()]}))
-    np.testing.assert_allclose(load_camera_path(matrices).cameras[0].fov_x, 126.8698976)
-
-
-MOVED = {"fov": 60, "to_world": [np.eye(4).tolist()] * 2}
-
-
-@pytest.mark.parametrize(
-    ("objects", "message"),
-    [
-        ([], "expected 'objects' to map ids to lists of matrices, found list"),
-        ({"ball": [np.eye(4).tolist()]}, r"'ball': expected 2 matrices .* found shape \(1, 4, 4\)"),
-        ({"ball": [[1, 2], [3]]}, "'ball': expected matrices"),
-        ({"ball": [np.eye(3).tolist()] * 2}, "'ball': expected 2 matrices of 4x4 or 3x4"),
-        ({"ball": [np.eye(4).tolist(), np.zeros((4, 4)).tolist()]}, "found something else in frame 1"),
-    ],
-)
-def test_bad_paths_of_objects(tmp_path: Path, objects: Any, message: str) -> None:
-    path = tmp_path / "shot.json"
-    path.write_text(json.dumps({**MOVED, "objects": objects}))
-    with pytest.raises(InputError, match=message) as caught:
-        load_camera_path(path)
-    assert str(caught.value).startswith(str(path))
-
-
-def test_paths_of_objects(tmp_path: Path) -> None:
-    path = tmp_path / "shot.json"
-    moved = np.eye(4)
-    moved[:3, 3] = 1, 2, 3
-    path.write_text(json.dumps({**MOVED, "objects": {"ball": [np.eye(4)[:3].tolist(), moved[:3].tolist()]}}))
-    shot = load_camera_path(path)
-    assert list(shot.moves) == ["ball"]
-    np.testing.assert_array_equal(shot.moves["ball"], [np.eye(4), moved])
-    path.write_text(json.dumps(MOVED))
-    assert load_camera_path(path).moves == {}
-
-
-TUNGSTEN = """{"bsdfs": [{"name": "odd, ]"},], "camera": {"resolution": [1280, 720], "transform":
-{"position": [%d, 2, 3,], "look_at": [0, 1, 0], "up": [0, 1, 0]}, "type": "pinhole", "fov": 65.0,},}"""
-
-
-def test_camera_paths_of_tungsten_scenes(tmp_path: Path) -> None:
-    """The scenes are written as published: a file per frame, with commas that JSON does not allow."""
-    expected = [Camera.look_at((x, 2, 3), (0, 1, 0), fov_x=65).to_world for x in (1, 2, 10)]
-    scenes = tmp_path / "scenes"
-    scenes.mkdir()
-    for name, x in (("0", 1), ("2", 2), ("10", 10)):
-        (scenes / f"spp_4096_scene_{name}.json").write_text(TUNGSTEN % x)
-    together = tmp_path / "together.json"
-    together.write_text("[" + ",".join(TUNGSTEN % x for x in (1, 2, 10)) + ",]")
-    for path in (scenes, together):
-        cameras = load_camera_path(path).cameras
-        assert [camera.fov_x for camera in cameras] == [65, 65, 65]
-        np.testing.assert_allclose([camera.to_world for camera in cameras], expected)
-    (one,) = load_camera_path(scenes / "spp_4096_scene_2.json").cameras
-    np.testing.assert_allclose(one.to_world, expected[1])
 
 
 @pytest.mark.parametrize(

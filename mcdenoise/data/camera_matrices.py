@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -85,10 +84,6 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     try:
         text = read_text(path, _LARGEST_FILE, errors="replace")
     except OSError as error:
-        if error.errno == errno.EFBIG:
-            raise InputError(
-                f"{path}: expected at most {_LARGEST_FILE} bytes, found more; is this a camera_matrices.h?"
-            ) from error
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     text = _COMMENT.sub(" ", text)
     matrices = _read_variable(path, text, "camera_matrices", (-1, 4, 4))

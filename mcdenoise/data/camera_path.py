@@ -251,15 +251,11 @@ def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:
 
 def _read_json(path: Path) -> Any:
     try:
-        text = read_text(path)
+        return json.loads(_LAST_COMMA.sub(lambda match: match[1] or "", read_text(path)))
     except OSError as error:
         raise InputError(
             f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"
         ) from error
-    except ValueError as error:
-        raise InputError(f"{path}: expected JSON, found no UTF-8 text; check that it is a camera path") from error
-    try:
-        return json.loads(_LAST_COMMA.sub(lambda match: match[1] or "", text))
     except (ValueError, RecursionError) as error:
         raise InputError(
             f"{path}: expected JSON, found something else ({error}); check that it is a camera path"
