@@ -272,24 +272,19 @@ def _png_is_whole(path: Path) -> bool:
     The library prints its errors about damaged chunks to the terminal, and does not notice missing chunks at the end.
     """
     try:
-        left = os.path.getsize(path) - len(_PNG)
-        with path.open("rb") as file:
-            if file.read(len(_PNG)) != _PNG:
-                return True
-            while left >= 12:
-                length, kind = struct.unpack(">I4s", file.read(8))
-                left -= length + 12
-                # Checked before memory is allocated.
-                if left < 0:
-                    return False
-                content = file.read(length)
-                if file.read(4) != struct.pack(">I", zlib.crc32(content, zlib.crc32(kind))):
-                    return False
-                if kind == b"IEND":
-                    return True
-    except (OSError, struct.error) as error:
+        content = path.read_bytes()
+    except OSError as error:
         raise InputError(f"{path}: cannot be read ({error}); check its permissions") from error
-    return False
+    place = len(_PNG)
+    while content.startswith(_PNG) and place + 12 <= len(content):
+        length, kind = struct.unpack_from(">I4s", content, place)
+        end = place + 8 + length
+        if content[end : end + 4] != struct.pack(">I", zlib.crc32(content[place + 4 : end])):
+            return False
+        if kind == b"IEND":
+            return True
+        place = end + 4
+    return not content.startswith(_PNG)
 
 
 def _what_is_at(path: Path) -> str:

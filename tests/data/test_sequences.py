@@ -155,7 +155,7 @@ def _without_albedo(inputs: Path) -> None:
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "buffer of one frame": (
         lambda inputs: (inputs / "shading_normal2.exr").unlink(),
-        r"shading_normal2\.exr: expected buffer 'normal' for every frame",
+        r"shading_normal#\.exr: expected buffer 'normal'.*frame 2",
     ),
     "size of one buffer": (
         lambda inputs: _rewrite(inputs / "albedo1.exr", lambda image: image[1:], RGB),
@@ -171,7 +171,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "depth in three channels": (
         lambda inputs: _rewrite(inputs / "depth0.exr", lambda image: image.repeat(3, axis=2), RGB),
-        r"depth0\.exr: expected 1 channels",
+        r"depth1\.exr: expected channel 'R'",
     ),
     "too few matrices": (_no_matrix_for_the_last_frame, "expected a matrix for frame 3, found 3"),
     "no EXR": (lambda inputs: (inputs / "albedo3.exr").write_bytes(b"hello"), r"albedo3\.exr: expected an image"),

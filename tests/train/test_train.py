@@ -382,7 +382,7 @@ def test_an_absurdly_bright_pixel_does_not_stop_a_run(
         ("albedo", "expected albedo, normal, depth to train this model on, found no albedo"),
         ("shading_normal", "expected albedo, normal, depth to train this model on, found no normal"),
         ("*2", "expected frame 2 after frame 1, found 3"),
-        ("albedo2", "expected buffer 'albedo' for every frame, found it for some"),
+        ("albedo2", "expected buffer 'albedo' for every frame, found none"),
     ],
 )
 def test_data_that_cannot_be_trained_on_leaves_no_run(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, find_camera_matrices
+from mcdenoise.data.camera_matrices import MATRICES
 from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, write_exr
 from mcdenoise.data.files import make_folder, write_text
-from mcdenoise.data.images import Part, read_image_header, read_picture
-from mcdenoise.data.readers.choice import Choice
-from mcdenoise.data.readers.diffuse_specular import DIFFUSE, SPECULAR, find_splits
-from mcdenoise.data.readers.examining import examine, examine_parts
+from mcdenoise.data.images import read_image_header, read_picture
+from mcdenoise.data.readers.diffuse_specular import DIFFUSE, LIGHT_PARTS, SPECULAR
 from mcdenoise.data.readers.files import RenderedFiles, as_tensor
-from mcdenoise.data.readers.layers import Layer, layers_of
-from mcdenoise.data.readers.names import FileGroup, find_files, pattern_of
-from mcdenoise.data.readers.opening import check_files
-from mcdenoise.data.readers.samples import SampleLayers, split_samples, write_samples
+from mcdenoise.data.readers.names import FileGroup, find_files
+from mcdenoise.data.readers.opening import open_files
+from mcdenoise.data.readers.samples import write_samples
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -72,12 +69,11 @@ class _BmfrFolder(RenderedFiles):
 
     Args:
         path: the folder that holds the files.
-        more: the kinds of files for each noise seed from 1 on.
     """
 
     path: Path
-    more: Sequence[Sequence[FileGroup]] = ()
     fits_cameras = False
+    one_window = True
 
     @property
     def folders(self) -> set[Path]:
@@ -90,9 +86,8 @@ class _BmfrFolder(RenderedFiles):
     @property
     def noisy(self) -> frozenset[str]:
         """Names of the buffers that differ between noise seeds, as :meth:`frame` returns them."""
-        layers = {"samples": self.samples.radiance[0]} if self.samples else {}
-        layers |= {name: lights[0].layers[0] for name, lights in (self.split.parts if self.split else {}).items()}
-        layers |= self.choice.layers
+        parts = {name: lights[0].layers[0] for name, lights in self.split.parts.items()}
+        layers = {**dict(zip(["samples"], self.samples.radiance, strict=False)), **parts, **self.choice.layers}
         own = {
             name for name, each in layers.items() for more in self.more if more[each.group] != self.groups[each.group]
         }
@@ -101,7 +96,7 @@ class _BmfrFolder(RenderedFiles):
 
     @property
     def unused(self) -> list[str]:
-        return _others(self.path)
+        return [*super().unused, *_others(self.path)]
 
     def _files(self, number: int) -> list[Path]:
         description = self.path / _DESCRIPTION
@@ -209,7 +204,7 @@ def open_bmfr(
     choose_numbers: Callable[[list[int]], list[int]],
     color_has_albedo: bool | None = None,
 ) -> RenderedFiles:
-    """Check the selected frames of a folder by file names and headers, and the values of the first frame.
+    """Open the selected frames of a folder as :func:`open_files` does: file names are the names of buffers.
 
     Args:
         path: the folder.
@@ -222,75 +217,38 @@ def open_bmfr(
         InputError: a file is missing or unreadable, or has other sizes or channels than expected.
     """
     numbers = choose_numbers(sorted(files["color"]))
-    files = {name: own for name, own in files.items() if any(number in own for number in numbers)}
-    _check_complete(path, files, numbers)
+    files = _of_frames(files, numbers)
     groups = [FileGroup(_STEMS[name], own) for name, own in files.items()]
-    parts = [read_image_header(next(own[n] for n in numbers if n in own)).parts[:1] for own in files.values()]
-    layers: dict[str, Layer] = {}
-    samples: SampleLayers | None = None
-    for index, (name, (part,)) in enumerate(zip(files, parts, strict=True)):
-        if name == "samples":
-            samples, _ = split_samples(layers_of(index, "", [part]))
-            if samples is None:
-                found = ", ".join(part.channels[:8])
-                raise InputError(f"{files[name][numbers[0]]}: expected layers sample0.RGB, sample1.RGB, found {found}")
-        else:
-            layers[name] = _layer_of(index, name, files[name], part)
-    split = find_splits([], layers["color"], {name: layers[name] for name in (DIFFUSE, SPECULAR) if name in layers})
-    buffers = {name: layers[name] for name in sorted(layers, key=lambda name: name != "color")}
-    choice = Choice({name: layer for name, layer in buffers.items() if name not in (DIFFUSE, SPECULAR)})
-    choice.written = [layers["color"]]
-    more = _find_noise_seeds(path, numbers, groups, files)
-    shot = _BmfrFolder(groups, parts, choice, path=path, numbers=numbers, more=more)
-    everywhere = {*(layer for each in split for layer in each.layers), *(samples.layers if samples else ())}
-    for own in (groups, *more):
-        everywhere &= check_files(replace(shot, groups=own), split, samples, one_window=True)
+    stated = _color_has_albedo(path, "albedo" in files) if color_has_albedo is None else color_has_albedo
+    make = partial(_BmfrFolder, path=path, more=_find_noise_seeds(path, numbers, files))
+    shot = open_files(groups, lambda present: present, str(path), {}, stated, make=make)
+    # Motion may be there and of no use.
+    for name in files.keys() - shot.choice.layers.keys() - LIGHT_PARTS - {"motion"}:
+        first = next(iter(files[name].values()))
+        raise InputError(
+            f"{first}: expected {BUFFERS[name].channels} channels for buffer '{name}', found "
+            f"{', '.join(read_image_header(first).parts[0].channels[:8])}; write only those that belong to it"
+        )
     if len({DIFFUSE, SPECULAR} & files.keys()) == 1:
         shot.warnings.append("'diffuse', 'specular': expected both, which add up to the color, found one: not used")
-    shot.cameras = find_camera_matrices(path, numbers[-1])
-    stated = _color_has_albedo(path, "albedo" in files) if color_has_albedo is None else color_has_albedo
-    images = examine(shot, stated)
-    examine_parts(shot, images["color"], split, samples, everywhere)
     return shot
 
 
-def _check_complete(folder: Path, files: Files, numbers: Sequence[int]) -> None:
-    """Check that every frame has every buffer but the reference."""
-    for name, own in files.items():
-        missing = [number for number in numbers if number not in own]
-        if missing and name != "reference":
-            raise InputError(
-                f"{folder / f'{_STEMS[name]}{missing[0]}.exr'}: expected buffer '{name}' for every frame, found it for "
-                f"some; render it, or remove all {_STEMS[name]} files"
-            )
+def _of_frames(files: Files, numbers: Sequence[int]) -> dict[str, dict[int, Path]]:
+    """The files of some frames, of those buffers that any of them has."""
+    chosen = {name: {number: own[number] for number in numbers if number in own} for name, own in files.items()}
+    return {name: own for name, own in chosen.items() if own}
 
 
-def _layer_of(group: int, name: str, files: Mapping[int, Path], part: Part) -> Layer:
-    """All channels of a buffer's file."""
-    if len(part.channels) != BUFFERS[name].channels or part.integers:
-        found = "whole numbers" if part.integers else str(len(part.channels))
-        raise InputError(
-            f"{next(iter(files.values()))}: expected {BUFFERS[name].channels} channels for buffer '{name}', found "
-            f"{found} ({', '.join(part.channels[:8])}); write only those that belong to it"
-        )
-    letters = ("",) if len(part.channels) == 1 else tuple("rgb"[: len(part.channels)])
-    pattern = pattern_of(FileGroup(_STEMS[name], files))
-    return Layer(group, 0, _STEMS[name], part.channels, letters, anonymous=True, files=pattern)
-
-
-def _find_noise_seeds(
-    path: Path, numbers: list[int], groups: Sequence[FileGroup], files: Files
-) -> list[list[FileGroup]]:
+def _find_noise_seeds(path: Path, numbers: Sequence[int], files: Files) -> list[list[FileGroup]]:
     """Files of the noise seeds 1, 2, ..., up to the first seed that lacks a color and so is still being rendered."""
     found: list[list[FileGroup]] = []
     while os.path.isdir(folder := noise_seed_folder(path, 1 + len(found))):
-        listed = _list_files(folder)
-        if not all(number in listed["color"] for number in numbers):
+        own = _of_frames(_list_files(folder), numbers)
+        if len(own.get("color", ())) < len(numbers):
             break
-        own = {name: listed[name] for name in files if name != "reference" and any(n in listed[name] for n in numbers)}
-        _check_complete(folder, own, numbers)
-        kinds = zip(files, groups, strict=True)
-        found.append([replace(group, files=own[name]) if name in own else group for name, group in kinds])
+        own.pop("reference", None)
+        found.append([FileGroup(_STEMS[name], own.get(name, all_seeds)) for name, all_seeds in files.items()])
     return found
 
 
@@ -369,7 +327,7 @@ def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> b
     return _is_whole(path, size, len(_CHANNELS[BUFFERS[name].channels]), status.st_mtime_ns, status.st_size)
 
 
-@functools.cache
+@cache
 def _is_whole(path: Path, size: tuple[int, int], channels: int, *_: int) -> bool:
     try:
         part = read_picture(path)[1].parts[0]

@@ -20,8 +20,6 @@ from mcdenoise.frame import BUFFERS
 # Buffers to which the user may map a layer.
 MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
-# Number of values to compare at a time: 64 MiB.
-_AT_ONCE = 2**24
 # Rec. 709 to XYZ (ITU-R BT.709), and the largest difference of a converted color relative to the light of a pixel.
 _TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 _SAME_COLOR = 2e-3
@@ -236,26 +234,15 @@ def _twins(color: Layer, unnamed: Sequence[Layer], read: Read) -> list[Layer]:
     """Layers equal to the color: Mitsuba writes the color of a nested integrator twice."""
     place = (color.group, color.part)
     others = [each for each in unnamed if each.is_color and each != color and (each.group, each.part) == place]
-    if not others:
-        return []
     # Compare a few rows first, since every read decompresses all layers of these rows.
-    first = read([color, *others], _LOWEST)
-    alike = [layer for layer in others if _equal(first[layer], first[color])]
-    height = len(first[color])
-    whole = _whole(color, read) if alike else first[color]
-    rows = max(16, _AT_ONCE // max(1, whole[0].size * len(alike)))
-    for part in (slice(top, top + rows) for top in range(0, len(whole), rows) if alike and len(whole) > height):
-        pixels = read(alike, part)
-        alike = [layer for layer in alike if _equal(pixels[layer], whole[part])]
-    return alike
+    for rows in (_LOWEST, _ALL):
+        pixels = {layer: image[..., :3] for layer, image in (read([color, *others], rows) if others else {}).items()}
+        others = [each for each in others if np.array_equal(pixels[each], pixels[color], equal_nan=True)]
+    return others
 
 
 def _whole(layer: Layer, read: Read) -> Image:
     return read([layer], _ALL)[layer]
-
-
-def _equal(one: Image, other: Image) -> bool:
-    return np.array_equal(one[..., :3], other[..., :3], equal_nan=True)
 
 
 def _conversions(color: Layer, unnamed: Sequence[Layer], read: Read) -> dict[Layer, Array]:

@@ -88,6 +88,9 @@ class Split:
         return found
 
 
+NO_SPLIT = Split({})
+
+
 def find_splits(layers: Sequence[Layer], color: Layer, mapped: Mapping[str, Layer]) -> list[Split]:
     """Find candidates for the parts of a color by names of layers; only their values tell whether they are.
 

@@ -235,7 +235,7 @@ def examine_parts(
     shot: RenderedFiles,
     color: Image,
     splits: Sequence[Split],
-    samples: SampleLayers | None,
+    samples: SampleLayers,
     everywhere: Collection[Layer],
 ) -> None:
     """Use parts of the light and samples that every frame has, if the first frame's add up to its color.
@@ -245,7 +245,7 @@ def examine_parts(
         color: ``(H, W, 3)`` of the first frame, as stored.
         splits: candidates; the first one that adds up is used.
         samples: the layers of samples.
-        everywhere: result of :func:`check_files`.
+        everywhere: those of these layers that every frame has, with the pixels of the color.
     """
     refused: list[tuple[Split, float, float]] = []
     for split in (each for each in splits if shot.color_has_albedo and each.layers <= {*everywhere}):
@@ -278,7 +278,7 @@ def examine_parts(
                 f"'diffuse', 'specular': {found} have {light:.1%} of the light of the color and differ from it in "
                 f"{far:.0%} of the pixels: not used; {why}"
             )
-    if samples is None:
+    if not samples.radiance:
         return
     if not samples.layers <= {*everywhere}:
         shot.warnings.append("'samples': some frames have others, or of other pixels, or none: not used")

@@ -16,17 +16,17 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.exr import Image, Mask, Metadata
 from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_image_header
+from mcdenoise.data.radiance import decode
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice
-from mcdenoise.data.readers.diffuse_specular import Split
+from mcdenoise.data.readers.diffuse_specular import NO_SPLIT, Split
 from mcdenoise.data.readers.layers import GREY, Layer, read_files
-from mcdenoise.data.readers.lights import is_light, keeps, kept_together, stored
+from mcdenoise.data.readers.lights import is_light, stored
 from mcdenoise.data.readers.names import FileGroup
 from mcdenoise.data.readers.rewrite import write_like
-from mcdenoise.data.readers.samples import SampleLayers
+from mcdenoise.data.readers.samples import NO_SAMPLES, SampleLayers
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
-from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, scale_samples
@@ -58,6 +58,7 @@ class RenderedFiles(FrameSequence):
         split: the layers of diffuse and specular light, if they add up to the color.
         samples: the layers of single samples, if their mean is the color.
         kept: layers of some files, which need not be read again while a shot is being opened.
+        more: the kinds of files for each further noise seed.
     """
 
     groups: Sequence[FileGroup]
@@ -70,11 +71,13 @@ class RenderedFiles(FrameSequence):
     positions_of_camera: bool = False
     has_camera: bool = False
     drops_positions: bool = False
-    split: Split | None = None
-    samples: SampleLayers | None = None
+    split: Split = NO_SPLIT
+    samples: SampleLayers = NO_SAMPLES
     kept: dict[tuple[Path, Layer], Image] = field(default_factory=dict)
-    # Whether a camera is found from positions where none is given.
+    more: Sequence[Sequence[FileGroup]] = ()
+    # Whether a camera is found from positions where none is given, and data windows must not differ.
     fits_cameras: ClassVar[bool] = True
+    one_window: ClassVar[bool] = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -95,8 +98,7 @@ class RenderedFiles(FrameSequence):
             present.add("view_projection")
         if self.drops_positions:
             present -= {"position", "view_projection"}
-        present |= frozenset() if self.split is None else self.split.names
-        return frozenset(present | (set() if self.samples is None else {"samples"}))
+        return frozenset(present | self.split.names | ({"samples"} if self.samples.radiance else set()))
 
     @property
     def folders(self) -> set[Path]:
@@ -117,8 +119,7 @@ class RenderedFiles(FrameSequence):
     def _further(self) -> set[Layer]:
         """The layers of light and of samples, and the colors that light is divided by."""
         found = {layer for light in self.lights.values() for layer in light.layers}
-        found |= set() if self.split is None else self.split.layers
-        return found | (set() if self.samples is None else self.samples.layers)
+        return found | self.split.layers | self.samples.layers
 
     @property
     def reference_numbers(self) -> list[int]:
@@ -140,19 +141,19 @@ class RenderedFiles(FrameSequence):
         return as_tensor(self.read_buffers(number, ["reference"])["reference"])
 
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
-        split = self.split if buffers is None or self.split is None or self.split.names & set(buffers) else None
-        samples = self.samples if buffers is None or "samples" in buffers else None
+        split = self.split if buffers is None or self.split.names & set(buffers) else NO_SPLIT
+        samples = self.samples if buffers is None or "samples" in buffers else NO_SAMPLES
         names = [
             name
             for name, layer in self.choice.layers.items()
             if self.has(layer, number) and (reference or name != "reference")
         ]
         wanted = {layer for light in self.lights.values() for layer in light.layers}
-        wanted |= (set() if split is None else split.layers) | (set() if samples is None else samples.layers)
+        wanted |= split.layers | samples.layers
         pixels = self.read(number, [*wanted, *(self.choice.layers[name] for name in names)])
         images = {name: self.as_buffer(number, name, pixels[self.choice.layers[name]]) for name in names}
         lights = {name: _without_lossy_black(light.radiance(pixels)) for name, light in self.lights.items()}
-        if split is not None:
+        if split.parts:
             parts = split.buffers(pixels, images["color"][..., :3])
             if parts is None:
                 warnings.warn(
@@ -161,7 +162,7 @@ class RenderedFiles(FrameSequence):
                     stacklevel=2,
                 )
             images |= parts or {}
-        single = None if samples is None else torch.from_numpy(samples.samples(pixels))[None]
+        single = torch.from_numpy(samples.samples(pixels))[None] if samples.radiance else None
         del pixels
         frame = self.as_frame(number, images, lights)
         if single is not None and not self.color_has_albedo and frame.albedo is not None:
@@ -227,10 +228,9 @@ class RenderedFiles(FrameSequence):
         divisors = {name: self.lights[name].color for name in radiances}
         pixels = self.read(number, [layer for layer in divisors.values() if layer is not None])
         colors = {name: None if layer is None else pixels[layer][..., :3] for name, layer in divisors.items()}
-        held = kept_together(radiances, {name: keeps(color) for name, color in colors.items()}) if radiances else {}
         files: defaultdict[int, dict[tuple[int, str], Image]] = defaultdict(dict)
-        for name, radiance in held.items():
-            layer, planes = self.lights[name].layers[0], stored(radiance, colors[name])
+        for name, planes in (stored(radiances, colors) if radiances else {}).items():
+            layer = self.lights[name].layers[0]
             files[layer.group] |= {(layer.part, each): planes[..., i] for i, each in enumerate(layer.channels[:3])}
         return files
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import Image, Mask
+from mcdenoise.data.exr import Image
 from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
 
@@ -104,33 +104,26 @@ class Light:
         return self.layers[1] if len(self.layers) > 1 else None
 
 
-def keeps(color: Image | None) -> Mask | bool:
-    """The pixels in which a layer can store light: those where the color by which it is divided is not nearly 0."""
-    return True if color is None else np.greater(color, _DARKEST)
+def stored(radiances: Mapping[str, Image], colors: Mapping[str, Image | None]) -> dict[str, Image]:
+    """Convert radiances to stored pixels, the inverse of :meth:`Light.radiance`.
 
-
-def stored(radiance: Image, color: Image | None) -> Image:
-    """Convert radiance to stored pixels, the inverse of :meth:`Light.radiance`."""
-    if color is None:
-        return radiance
-    result: Image = np.divide(radiance, color, out=np.zeros_like(radiance), where=color > _DARKEST)
-    return result
-
-
-def kept_together(radiances: Mapping[str, Image], kept: Mapping[str, Mask | bool]) -> dict[str, Image]:
-    """Move light of each layer from pixels where it cannot be stored to the other layers, preserving the sum.
-
-    Filters carry light across an edge to pixels where a layer is divided by a color of 0.
+    Filters carry light across an edge to pixels where a layer is divided by a color of nearly 0, and cannot store it:
+    there the other layers get it, so that the sum is preserved.
 
     Args:
         radiances: ``(H, W, 3)`` by layer.
-        kept: where each layer can store light.
+        colors: the colors by which the layers are divided.
     """
-    total = sum(radiances.values())
+    kept = {name: True if color is None else color > _DARKEST for name, color in colors.items()}
     held = {name: np.where(kept[name], radiance, 0) for name, radiance in radiances.items()}
-    left = sum(held.values())
+    total, left = np.asarray(sum(radiances.values())), np.asarray(sum(held.values()))
     scale = np.divide(total, left, out=np.ones_like(total), where=left > 0)
-    return {name: (radiance * scale).astype(np.float32) for name, radiance in held.items()}
+    found: dict[str, Image] = {}
+    for name, radiance in held.items():
+        light, color = (radiance * scale).astype(np.float32), colors[name]
+        zero = np.zeros_like(light)
+        found[name] = light if color is None else np.divide(light, color, out=zero, where=color > _DARKEST)
+    return found
 
 
 def difference(one: Image | Array, other: Image | Array, count: int) -> float:

@@ -16,6 +16,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import find_camera_matrices
 from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.images import ImageHeader, Part, Window, check_channels, read_channels, read_image_header
+from mcdenoise.data.radiance import decode
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
@@ -31,7 +32,6 @@ from mcdenoise.data.readers.layers import Layer, layers_of, read_files, read_lay
 from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, split_samples
-from mcdenoise.data.readers.transfer import decode
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
 
@@ -51,6 +51,7 @@ def open_files(
     color_has_albedo: bool | None = None,
     lights: Sequence[str] = (),
     color_space: ColorSpace = "auto",
+    make: Callable[..., RenderedFiles] = RenderedFiles,
 ) -> RenderedFiles:
     """Open the files of a shot: determine their contents by names, headers, and values of the first frames.
 
@@ -62,6 +63,7 @@ def open_files(
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
         lights: names of additive layers of radiance that are denoised with the color.
         color_space: that of images other than EXR; by default what the files say.
+        make: makes the shot, for a layout with conventions of its own.
 
     Raises:
         InputError: the files cannot be recognised, do not match one another, or cannot be read.
@@ -83,8 +85,10 @@ def open_files(
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
     parts = [_parts(header, color_space) for header in headers]
-    shot = RenderedFiles(groups, parts, choice, numbers=numbers, warnings=choice.warnings, kept=kept)
-    everywhere = check_files(shot, splits, samples)
+    shot = make(groups, parts, choice, numbers=numbers, warnings=choice.warnings, kept=kept)
+    everywhere = _check_files(shot, splits, samples)
+    for own in shot.more:
+        everywhere &= _check_files(replace(shot, groups=own), splits, samples)
     shot.lights, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
     shot.cameras = find_camera_matrices(shot.file(color, numbers[0]).parent, numbers[-1])
     images = examine(shot, color_has_albedo)
@@ -150,16 +154,13 @@ def open_result(path: Path) -> Result:
     return Result(path, layer, parts[layer.part].window)
 
 
-def check_files(
-    shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers | None, *, one_window: bool = False
-) -> set[Layer]:
+def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers) -> set[Layer]:
     """Check that every frame has every buffer, in the same display window; join data windows that differ.
 
     Args:
         shot: the files.
         splits: candidates for parts of the light.
         samples: layers of samples.
-        one_window: whether data windows must not differ.
 
     Returns:
         The layers of parts of the light and of samples that every frame has, with the data window of the color.
@@ -172,14 +173,15 @@ def check_files(
     for name, layer in sorted(shot.choice.layers.items()):
         missing = [number for number in shot.numbers if not shot.has(layer, number)]
         if missing and name != "reference":
+            group = shot.groups[layer.group]
+            place = next(iter(group.files.values())).parent / pattern_of(group)
             raise InputError(
-                f"{pattern_of(shot.groups[layer.group])}: expected buffer '{name}' for every frame, found none for "
-                f"frame {missing[0]}; render it, or leave the buffer out with --map {name}="
+                f"{place}: expected buffer '{name}' for every frame, found none for frame {missing[0]}; render it, or "
+                f"leave the buffer out with --map {name}="
             )
     written = [color, *shot.choice.written]
     used = dict.fromkeys([*written, *shot.choice.layers.values()])
-    everywhere = {layer for split in splits for layer in split.layers}
-    everywhere |= set() if samples is None else samples.layers
+    everywhere = samples.layers.union(*(split.layers for split in splits))
     files = {layer.group: shot.groups[layer.group].files for layer in (*used, *everywhere)}
     windows: set[Window | None] = set()
     colors: set[Window] = set()
@@ -187,7 +189,7 @@ def check_files(
         headers = {group: read_image_header(own[number]) for group, own in files.items() if number in own}
         found = {layer: _window_in(headers[layer.group], layer) for layer in used if layer.group in headers}
         for layer, window in found.items():
-            _check_window(shot.file(layer, number), headers[layer.group], layer, main, one_window)
+            _check_window(shot.file(layer, number), headers[layer.group], layer, main, shot.one_window)
             if layer == shot.choice.layers.get("reference") and window != found[color]:
                 raise InputError(
                     f"{shot.file(layer, number)}: expected a reference in the data window of the color, found another; "

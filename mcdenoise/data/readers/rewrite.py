@@ -21,7 +21,7 @@ import OpenEXR
 from mcdenoise.data.exr import LARGEST_HALF, Image, cannot_write, within_half, write_image
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
-from mcdenoise.data.readers.transfer import encode
+from mcdenoise.data.radiance import encode
 
 # Names of the channels that DWA compression rounds, and its usual level.
 _DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45

@@ -51,7 +51,10 @@ class SampleLayers:
         return f"{len(self.radiance)} of a pixel{features}; their mean is the color"
 
 
-def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers | None, list[Layer]]:
+NO_SAMPLES = SampleLayers((), {})
+
+
+def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers, list[Layer]]:
     """Separate the layers of samples from all other layers: features of a sample are not buffers."""
     found: dict[str, dict[int, Layer]] = {}
     others = []
@@ -64,7 +67,7 @@ def split_samples(layers: Sequence[Layer]) -> tuple[SampleLayers | None, list[La
             others.append(layer)
     radiance = found.get("radiance", {})
     if not radiance:
-        return None, list(layers)
+        return NO_SAMPLES, list(layers)
     numbers = sorted(radiance)
     features = {
         name: tuple(found[name][n] for n in numbers) for name in FEATURES if found.get(name, {}).keys() >= {*numbers}
