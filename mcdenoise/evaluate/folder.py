@@ -99,7 +99,7 @@ class Evaluation:
 
     sequence: str
     images: Path | str
-    tables: dict[str, Table]
+    tables: dict[ProtocolName, Table]
     warping_error: tuple[float, float] | None = None
     reference_noise: float | None = None
     floor: dict[str, float] = field(default_factory=dict)
