@@ -226,7 +226,7 @@ def open_bmfr(
     for name in files.keys() - shot.choice.layers.keys() - LIGHT_PARTS - {"motion"}:
         first = next(iter(files[name].values()))
         raise InputError(
-            f"{first}: expected {BUFFERS[name].channels} channels for buffer '{name}', found "
+            f"{first}: expected {BUFFERS[name].channels} channels of floats for buffer '{name}', found "
             f"{', '.join(read_image_header(first).parts[0].channels[:8])}; write only those that belong to it"
         )
     if len({DIFFUSE, SPECULAR} & files.keys()) == 1:
