@@ -14,21 +14,9 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import (
-    box,
-    cylinder,
-    diffuse,
-    disk,
-    lamp,
-    metal,
-    plastic,
-    rectangle,
-    sphere,
-    textured,
-    tint,
-    varnish,
-)
-from mcdenoise.scenes.random.builder import place, rotate
+from mcdenoise.scenes.random.builder import Part, ball, box, plate, rod, rotate, scene_of, sheet
+from mcdenoise.scenes.random.materials import diffuse, glass, mirror, rough_metal, rough_plastic
+from mcdenoise.scenes.random.textures import tint
 
 
 def demo_scene() -> dict[str, Any]:
@@ -38,7 +26,7 @@ def demo_scene() -> dict[str, Any]:
         >>> demo_scene()["type"]
         'scene'
     """
-    return {"type": "scene", **_room(), **_lights(), **_shelf(), **_still_life(), **_foreground()}
+    return scene_of(_room() | _lights() | _shelf() | _still_life() | _foreground())
 
 
 def demo_cameras(frames: int = 16) -> list[Camera]:
@@ -60,40 +48,38 @@ def demo_cameras(frames: int = 16) -> list[Camera]:
     return cameras
 
 
-def _room() -> dict[str, Any]:
+def _room() -> dict[str, Part]:
     plaster = diffuse((0.72, 0.69, 0.63))
     return {
-        "floor": rectangle((0, 0, 0.5), (3, 3.5), rotate("x", -90), varnish(_planks())),
-        "ceiling": rectangle((0, 2.7, 0.5), (3, 3.5), rotate("x", 90), diffuse((0.8, 0.8, 0.78))),
-        "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_wallpaper())),
-        "wall_left": rectangle((-3, 1.35, 0.5), (3.5, 1.35), rotate("y", 90), plaster),
-        "wall_right": rectangle((3, 1.35, 0.5), (3.5, 1.35), rotate("y", -90), diffuse((0.62, 0.16, 0.1))),
-        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate("y", 180), plaster),
+        "floor": sheet((0, 0, 0.5), (3, 3.5), rough_plastic(_planks(), 0.15), rotate("x", -90)),
+        "ceiling": sheet((0, 2.7, 0.5), (3, 3.5), diffuse((0.8, 0.8, 0.78)), rotate("x", 90)),
+        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_wallpaper()), np.eye(4)),
+        "wall_left": sheet((-3, 1.35, 0.5), (3.5, 1.35), plaster, rotate("y", 90)),
+        "wall_right": sheet((3, 1.35, 0.5), (3.5, 1.35), diffuse((0.62, 0.16, 0.1)), rotate("y", -90)),
+        "wall_front": sheet((0, 1.35, 4), (3, 1.35), plaster, rotate("y", 180)),
         "skirting": box((0, 0.06, -2.98), (6, 0.12, 0.04), diffuse((0.75, 0.74, 0.7))),
     }
 
 
-def _lights() -> dict[str, Any]:
+def _lights() -> dict[str, Part]:
     black = diffuse((0, 0, 0))
-    window = rectangle((-2.96, 1.6, -0.9), (1.1, 0.8), rotate("y", 90), black)
-    bulb = {"type": "sphere", "to_world": place((2.05, 1.62, -2.2), 0, (0.17, 0.17, 0.17)), "bsdf": black}
     frame = diffuse((0.7, 0.7, 0.68))
     return {
-        "window": lamp(window, (10.5, 11.5, 13.0)),
+        "window": sheet((-2.96, 1.6, -0.9), (1.1, 0.8), black, rotate("y", 90), (10.5, 11.5, 13.0)),
         "window_post": box((-2.93, 1.6, -0.9), (0.05, 1.7, 0.06), frame),
         "window_bar": box((-2.93, 1.6, -0.9), (0.05, 0.06, 2.3), frame),
         "window_sill": box((-2.9, 0.77, -0.9), (0.2, 0.05, 2.4), frame),
-        "lamp_bulb": lamp(bulb, (21.0, 13.0, 6.5)),
-        "lamp_stand": cylinder((2.05, 0, -2.2), 1.46, 0.025, metal("Al", 0.15)),
-        "lamp_foot": box((2.05, 0.02, -2.2), (0.3, 0.04, 0.3), metal("Al", 0.15)),
+        "lamp_bulb": ball((2.05, 1.62, -2.2), 0.17, black, (21.0, 13.0, 6.5)),
+        "lamp_stand": rod((2.05, 0, -2.2), (2.05, 1.46, -2.2), 0.025, rough_metal("Al", 0.15)),
+        "lamp_foot": box((2.05, 0.02, -2.2), (0.3, 0.04, 0.3), rough_metal("Al", 0.15)),
     }
 
 
-def _shelf() -> dict[str, Any]:
+def _shelf() -> dict[str, Part]:
     """Two shelves of books and a painting on the back wall: fine detail that the filter should preserve."""
     rng = np.random.default_rng(7)
     wood = diffuse((0.33, 0.2, 0.11))
-    parts: dict[str, Any] = {}
+    parts: dict[str, Part] = {}
     red, blue, ochre = (0.6, 0.12, 0.08), (0.1, 0.25, 0.42), (0.75, 0.6, 0.25)
     palette = [red, blue, ochre, (0.12, 0.36, 0.25), (0.7, 0.68, 0.6), (0.3, 0.12, 0.3)]
     for level, base in enumerate((1.1, 1.65)):
@@ -103,38 +89,38 @@ def _shelf() -> dict[str, Any]:
             width, height = rng.uniform(0.05, 0.1), rng.uniform(0.26, 0.42)
             color = palette[int(rng.integers(len(palette)))]
             parts[f"book_{level}_{book}"] = box(
-                (left + width / 2, base + height / 2, -2.84), (0.94 * width, height, 0.2), plastic(color, 0.25)
+                (left + width / 2, base + height / 2, -2.84), (0.94 * width, height, 0.2), rough_plastic(color, 0.25)
             )
             left += width
     parts["picture_frame"] = box((0.75, 1.6, -2.97), (1.3, 0.95, 0.05), wood)
-    parts["picture"] = rectangle((0.75, 1.6, -2.94), (0.6, 0.425), np.eye(4), textured(_painting()))
+    parts["picture"] = sheet((0.75, 1.6, -2.94), (0.6, 0.425), diffuse(_painting()), np.eye(4))
     return parts
 
 
-def _still_life() -> dict[str, Any]:
+def _still_life() -> dict[str, Part]:
     return {
-        "rug": disk((0.1, 0.012, -0.7), 1.5, textured(_rings())),
-        "plinth": box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), textured(_tiles()), turn=25),
-        "glass_ball": sphere((0.75, 0.8, -1.25), 0.2, {"type": "dielectric", "int_ior": 1.5}),
-        "copper_ball": sphere((-0.3, 0.47, -0.95), 0.46, metal("Cu", 0.18)),
-        "blue_ball": sphere((0.42, 0.235, -0.2), 0.22, plastic((0.04, 0.16, 0.5), 0.05)),
-        "green_ball": sphere((-0.95, 0.185, -0.3), 0.17, plastic((0.1, 0.42, 0.12), 0.3)),
-        "mirror_ball": sphere((-0.08, 0.143, -0.1), 0.13, {"type": "conductor", "material": "Ag"}),
-        "yellow_cube": box((-1.5, 0.2, -1.3), (0.4, 0.4, 0.4), plastic((0.75, 0.45, 0.05), 0.2), turn=35),
+        "rug": plate((0.1, 0.012, -0.7), 1.5, diffuse(_rings())),
+        "plinth": box((0.75, 0.3, -1.25), (0.6, 0.6, 0.6), diffuse(_tiles()), turn=25),
+        "glass_ball": ball((0.75, 0.8, -1.25), 0.2, glass()),
+        "copper_ball": ball((-0.3, 0.47, -0.95), 0.46, rough_metal("Cu", 0.18)),
+        "blue_ball": ball((0.42, 0.235, -0.2), 0.22, rough_plastic((0.04, 0.16, 0.5), 0.05)),
+        "green_ball": ball((-0.95, 0.185, -0.3), 0.17, rough_plastic((0.1, 0.42, 0.12), 0.3)),
+        "mirror_ball": ball((-0.08, 0.143, -0.1), 0.13, mirror()),
+        "yellow_cube": box((-1.5, 0.2, -1.3), (0.4, 0.4, 0.4), rough_plastic((0.75, 0.45, 0.05), 0.2), turn=35),
         "bench": box((-1.5, 0.42, -2.5), (1.7, 0.06, 0.5), diffuse((0.5, 0.33, 0.18))),
         "bench_leg_0": box((-2.2, 0.2, -2.5), (0.08, 0.4, 0.4), diffuse((0.5, 0.33, 0.18))),
         "bench_leg_1": box((-0.8, 0.2, -2.5), (0.08, 0.4, 0.4), diffuse((0.5, 0.33, 0.18))),
-        "cushion": sphere((-2.0, 0.65, -2.5), 0.2, diffuse((0.1, 0.4, 0.42))),
+        "cushion": ball((-2.0, 0.65, -2.5), 0.2, diffuse((0.1, 0.4, 0.42))),
     }
 
 
-def _foreground() -> dict[str, Any]:
+def _foreground() -> dict[str, Part]:
     """A folding screen that shades a corner, and a slim column that the camera walks past."""
-    paper = textured(_lattice())
+    paper = diffuse(_lattice())
     return {
         "screen_0": box((1.62, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=55),
         "screen_1": box((1.96, 0.7, -0.75), (0.6, 1.4, 0.03), paper, turn=-55),
-        "column": cylinder((-0.72, 0, 1.1), 2.7, 0.055, plastic((0.55, 0.28, 0.12), 0.15)),
+        "column": rod((-0.72, 0, 1.1), (-0.72, 2.7, 1.1), 0.055, rough_plastic((0.55, 0.28, 0.12), 0.15)),
     }
 
 

@@ -14,25 +14,11 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.scenes.parts import (
-    box,
-    cylinder,
-    diffuse,
-    disk,
-    lamp,
-    metal,
-    plastic,
-    rectangle,
-    sphere,
-    textured,
-    tint,
-    varnish,
-)
-from mcdenoise.scenes.random.builder import place, rotate
-from mcdenoise.scenes.random.textures import Color
+from mcdenoise.scenes.random.builder import Part, ball, box, drum, rgb, rod, rotate, scene_of, sheet
+from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, mirror, pane, rough_metal, rough_plastic
+from mcdenoise.scenes.random.textures import Color, tint
 
 _TABLE = 0.74
-_MIRROR = {"type": "twosided", "bsdf": {"type": "conductor", "material": "Ag"}}
 
 
 def parlour_scene() -> dict[str, Any]:
@@ -42,16 +28,8 @@ def parlour_scene() -> dict[str, Any]:
         >>> parlour_scene()["type"]
         'scene'
     """
-    return {
-        "type": "scene",
-        **_room(),
-        **_lights(),
-        **_table(),
-        **_bottles(),
-        **_shelf(),
-        **_rods(),
-        "pillar": box((-0.8, 1.3, 0.6), (0.16, 2.6, 0.16), plastic((0.5, 0.46, 0.4), 0.3)),
-    }
+    pillar = box((-0.8, 1.3, 0.6), (0.16, 2.6, 0.16), rough_plastic((0.5, 0.46, 0.4), 0.3))
+    return scene_of(_room() | _lights() | _table() | _bottles() | _shelf() | _rods() | {"pillar": pillar})
 
 
 def parlour_cameras(frames: int = 8) -> list[Camera]:
@@ -79,92 +57,79 @@ def parlour_moves(frames: int = 8) -> dict[str, Array]:
     return {"pillar": path}
 
 
-def _room() -> dict[str, Any]:
+def _room() -> dict[str, Part]:
     return {
-        "floor": rectangle((0, 0, 0.4), (3, 3.6), rotate("x", -90), varnish(_parquet(), 0.12)),
-        "ceiling": rectangle((0, 2.7, 0.4), (3, 3.6), rotate("x", 90), diffuse((0.78, 0.77, 0.74))),
-        "wall_back": rectangle((0, 1.35, -3), (3, 1.35), np.eye(4), textured(_damask())),
-        "wall_left": rectangle((-3, 1.35, 0.4), (3.6, 1.35), rotate("y", 90), diffuse((0.3, 0.38, 0.42))),
-        "wall_right": rectangle((3, 1.35, 0.4), (3.6, 1.35), rotate("y", -90), diffuse((0.66, 0.6, 0.5))),
-        "wall_front": rectangle((0, 1.35, 4), (3, 1.35), rotate("y", 180), diffuse((0.7, 0.68, 0.62))),
-        "mirror": rectangle((-1.15, 1.5, -2.95), (0.55, 0.6), np.eye(4), _MIRROR),
-        "mirror_frame": box((-1.15, 1.5, -2.985), (1.22, 1.32, 0.05), metal("Au", 0.2)),
-        "page": rectangle((0.42, 1.6, -2.985), (0.3, 0.4), np.eye(4), textured(_writing())),
+        "floor": sheet((0, 0, 0.4), (3, 3.6), rough_plastic(_parquet(), 0.12), rotate("x", -90)),
+        "ceiling": sheet((0, 2.7, 0.4), (3, 3.6), diffuse((0.78, 0.77, 0.74)), rotate("x", 90)),
+        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_damask()), np.eye(4)),
+        "wall_left": sheet((-3, 1.35, 0.4), (3.6, 1.35), diffuse((0.3, 0.38, 0.42)), rotate("y", 90)),
+        "wall_right": sheet((3, 1.35, 0.4), (3.6, 1.35), diffuse((0.66, 0.6, 0.5)), rotate("y", -90)),
+        "wall_front": sheet((0, 1.35, 4), (3, 1.35), diffuse((0.7, 0.68, 0.62)), rotate("y", 180)),
+        "mirror": sheet((-1.15, 1.5, -2.95), (0.55, 0.6), mirror(), np.eye(4)),
+        "mirror_frame": box((-1.15, 1.5, -2.985), (1.22, 1.32, 0.05), rough_metal("Au", 0.2)),
+        "page": sheet((0.42, 1.6, -2.985), (0.3, 0.4), diffuse(_writing()), np.eye(4)),
     }
 
 
-def _lights() -> dict[str, Any]:
+def _lights() -> dict[str, Part]:
     """A window and a lamp behind the camera, which are reflected in mirror and table, and a visible lamp."""
     black = diffuse((0, 0, 0))
-    window = rectangle((-2.1, 1.65, 3.96), (0.7, 0.75), rotate("y", 180), black)
     return {
-        "window": lamp(window, (13.0, 14.5, 16.5)),
+        "window": sheet((-2.1, 1.65, 3.96), (0.7, 0.75), black, rotate("y", 180), (13.0, 14.5, 16.5)),
         "window_post": box((-2.1, 1.65, 3.93), (0.05, 1.5, 0.05), diffuse((0.7, 0.7, 0.68))),
         "window_bar": box((-2.1, 1.65, 3.93), (1.4, 0.05, 0.05), diffuse((0.7, 0.7, 0.68))),
-        "lamp_behind": lamp(sphere((-1.3, 1.8, 0.7), 0.1, black), (26.0, 16.0, 7.5)),
-        "lamp": lamp(sphere((0.2, 1.28, -2.0), 0.075, black), (42.0, 27.0, 13.0)),
-        "lamp_stand": cylinder((0.2, _TABLE, -2.0), 0.48, 0.012, metal("Al", 0.1)),
-        "spot": lamp(sphere((1.5, 2.3, -0.4), 0.05, black), (75.0, 66.0, 50.0)),
+        "lamp_behind": ball((-1.3, 1.8, 0.7), 0.1, black, (26.0, 16.0, 7.5)),
+        "lamp": ball((0.2, 1.28, -2.0), 0.075, black, (42.0, 27.0, 13.0)),
+        "lamp_stand": rod((0.2, _TABLE, -2.0), (0.2, _TABLE + 0.48, -2.0), 0.012, rough_metal("Al", 0.1)),
+        "spot": ball((1.5, 2.3, -0.4), 0.05, black, (75.0, 66.0, 50.0)),
     }
 
 
-def _table() -> dict[str, Any]:
-    wood = varnish(_dark_wood(), 0.035)
+def _table() -> dict[str, Part]:
+    wood = rough_plastic(_dark_wood(), 0.035)
     legs = {
         f"leg_{i}": box((x, 0.35, z), (0.07, 0.7, 0.07), diffuse((0.06, 0.03, 0.02)))
         for i, (x, z) in enumerate(((-1.0, -0.6), (1.2, -0.6), (-1.0, -2.1), (1.2, -2.1)))
     }
     return {
-        "table_top": rectangle((0.1, _TABLE, -1.35), (1.25, 0.9), rotate("x", -90), wood),
+        "table_top": sheet((0.1, _TABLE, -1.35), (1.25, 0.9), wood, rotate("x", -90)),
         "table_side": box((0.1, _TABLE - 0.03, -1.35), (2.5, 0.055, 1.8), diffuse((0.05, 0.025, 0.015))),
         **legs,
-        "bowl": sphere((-0.42, _TABLE + 0.15, -1.0), 0.15, metal("Cu", 0.12)),
-        "ball": sphere((-0.08, _TABLE + 0.07, -0.72), 0.07, {"type": "conductor", "material": "Ag"}),
-        "cup": sphere((0.86, _TABLE + 0.09, -0.85), 0.09, plastic((0.65, 0.62, 0.56), 0.05)),
+        "bowl": ball((-0.42, _TABLE + 0.15, -1.0), 0.15, rough_metal("Cu", 0.12)),
+        "ball": ball((-0.08, _TABLE + 0.07, -0.72), 0.07, mirror()),
+        "cup": ball((0.86, _TABLE + 0.09, -0.85), 0.09, rough_plastic((0.65, 0.62, 0.56), 0.05)),
         # Diffuse objects with contact shadows.
         "die": box((0.3, _TABLE + 0.04, -0.62), (0.08, 0.08, 0.08), diffuse((0.75, 0.7, 0.6)), turn=30),
         "slab": box((-0.72, _TABLE + 0.012, -0.75), (0.24, 0.024, 0.16), diffuse((0.15, 0.3, 0.24)), turn=-20),
-        "letter": {
-            "type": "rectangle",
-            "to_world": place((0.55, _TABLE + 0.003, -0.66), 0, (0.13, 0.09, 1), rotate("y", -15) @ rotate("x", -90)),
-            "bsdf": textured(_writing()),
-        },
+        "letter": sheet(
+            (0.55, _TABLE + 0.003, -0.66), (0.13, 0.09), diffuse(_writing()), rotate("y", -15) @ rotate("x", -90)
+        ),
     }
 
 
-def _bottles() -> dict[str, Any]:
+def _bottles() -> dict[str, Part]:
     """Closed solids of glass, as Mitsuba's dielectric requires, and thin tumblers."""
-    parts: dict[str, Any] = {}
+    parts: dict[str, Part] = {}
     tints: list[Color] = [(0.35, 0.75, 0.4), (0.85, 0.5, 0.15), (0.9, 0.95, 0.95)]
     for index, (x, z, height) in enumerate(((0.5, -1.85, 0.3), (0.68, -1.7, 0.24), (0.9, -1.9, 0.34))):
-        glass = {
-            "type": "dielectric",
-            "int_ior": 1.5,
-            "specular_transmittance": {"type": "rgb", "value": list(tints[index])},
-        }
-        parts |= _solid(f"bottle_{index}", (x, _TABLE + 0.001, z), height, 0.055, glass)
-        parts |= _solid(f"neck_{index}", (x, _TABLE + 0.002 + height, z), 0.1, 0.018, glass)
+        tinted = glass() | {"specular_transmittance": rgb(tints[index])}
+        parts |= _solid(f"bottle_{index}", (x, _TABLE + 0.001, z), height, 0.055, tinted)
+        parts |= _solid(f"neck_{index}", (x, _TABLE + 0.002 + height, z), 0.1, 0.018, tinted)
     for index, (x, z) in enumerate(((0.38, -1.35), (0.62, -1.3), (0.5, -1.08))):
-        pane = {"type": "thindielectric", "int_ior": 1.5}
-        parts[f"tumbler_{index}"] = cylinder((x, _TABLE + 0.001, z), 0.13, 0.042, pane)
-    parts["glass_ball"] = sphere((0.15, _TABLE + 0.085, -1.2), 0.084, {"type": "dielectric", "int_ior": 1.5})
+        parts[f"tumbler_{index}"] = rod((x, _TABLE + 0.001, z), (x, _TABLE + 0.131, z), 0.042, pane())
+    parts["glass_ball"] = ball((0.15, _TABLE + 0.085, -1.2), 0.084, glass())
     return parts
 
 
-def _solid(name: str, foot: Color, height: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    x, y, z = foot
-    return {
-        f"{name}_side": cylinder(foot, height, radius, bsdf),
-        f"{name}_foot": disk(foot, radius, bsdf, up=False),
-        f"{name}_top": disk((x, y + height, z), radius, bsdf),
-    }
+def _solid(name: str, foot: Color, height: float, radius: float, bsdf: Bsdf) -> dict[str, Part]:
+    return dict(zip((f"{name}_side", f"{name}_top", f"{name}_foot"), drum(foot, height, radius, bsdf), strict=True))
 
 
-def _shelf() -> dict[str, Any]:
+def _shelf() -> dict[str, Part]:
     """Two shelves of books, a few millimetres apart, before a black back wall."""
     rng = np.random.default_rng(12)
     wood = diffuse((0.22, 0.13, 0.07))
-    parts: dict[str, Any] = {"shelf_back": box((1.65, 1.55, -2.98), (1.3, 1.1, 0.03), diffuse((0.01, 0.01, 0.01)))}
+    parts: dict[str, Part] = {"shelf_back": box((1.65, 1.55, -2.98), (1.3, 1.1, 0.03), diffuse((0.01, 0.01, 0.01)))}
     for level, base in enumerate((1.05, 1.55)):
         parts[f"board_{level}"] = box((1.65, base - 0.02, -2.84), (1.3, 0.04, 0.28), wood)
         left, book = 1.02, 0
@@ -172,30 +137,22 @@ def _shelf() -> dict[str, Any]:
             width, height = rng.uniform(0.03, 0.065), rng.uniform(0.28, 0.42)
             red, green, blue = (0.05 + 0.6 * rng.random(3) ** 1.5).tolist()
             parts[f"book_{level}_{book}"] = box(
-                (left + width / 2, base + height / 2, -2.83), (width, height, 0.2), plastic((red, green, blue), 0.3)
+                (left + width / 2, base + height / 2, -2.83),
+                (width, height, 0.2),
+                rough_plastic((red, green, blue), 0.3),
             )
             left, book = left + width + float(rng.choice([0.003, 0.006, 0.012])), book + 1
     return parts
 
 
-def _rods() -> dict[str, Any]:
+def _rods() -> dict[str, Part]:
     """Rods of 1 to 4 millimetres that hang from the ceiling, bright and dark, and one that leans."""
-    rods: dict[str, Any] = {
-        f"rod_{index}": cylinder(
-            (-0.62 + 0.055 * index, 1.25, -1.7 - 0.04 * (index % 3)),
-            1.45,
-            0.0005 * (1 + index % 4),
-            metal("Al", 0.2) if index % 2 else diffuse((0.02, 0.02, 0.02)),
-        )
-        for index in range(10)
-    }
-    rods["rod_leaning"] = {
-        "type": "cylinder",
-        "p0": [-0.35, _TABLE, -0.55],
-        "p1": [1.05, 1.75, -1.9],
-        "radius": 0.0025,
-        "bsdf": diffuse((0.8, 0.78, 0.7)),
-    }
+    rods: dict[str, Part] = {}
+    for index in range(10):
+        x, z = -0.62 + 0.055 * index, -1.7 - 0.04 * (index % 3)
+        metal = rough_metal("Al", 0.2) if index % 2 else diffuse((0.02, 0.02, 0.02))
+        rods[f"rod_{index}"] = rod((x, 1.25, z), (x, 2.7, z), 0.0005 * (1 + index % 4), metal)
+    rods["rod_leaning"] = rod((-0.35, _TABLE, -0.55), (1.05, 1.75, -1.9), 0.0025, diffuse((0.8, 0.78, 0.7)))
     return rods
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -34,16 +34,25 @@ class Part:
     Args:
         kind: a shape plugin of Mitsuba.
         to_group: ``(4, 4)`` transform from the shape's own space.
-        material: result of :meth:`SceneBuilder.material`.
+        material: description of a material, or result of :meth:`SceneBuilder.material`.
         radiance: emitted radiance, if it is a light.
         mesh: triangles of a part of the kind ``"mesh"``.
     """
 
     kind: str
     to_group: Array
-    material: dict[str, str]
+    material: Bsdf
     radiance: Color | None = None
     mesh: Mesh | None = None
+
+    def shape(self, to_world: Array) -> dict[str, Any]:
+        """Its entry in a Mitsuba dictionary, at a place."""
+        shape: dict[str, Any] = {"type": self.kind, "to_world": to_world, "bsdf": self.material}
+        if self.mesh is not None:
+            shape["mesh"] = self.mesh
+        if self.radiance is not None:
+            shape["emitter"] = {"type": "area", "radiance": rgb(self.radiance), "sampling_weight": 1.0}
+        return shape
 
 
 class SceneBuilder:
@@ -88,13 +97,9 @@ class SceneBuilder:
         for part in parts:
             matrix = part.to_group if to_world is None else to_world @ part.to_group
             name = f"{'lamp' if part.radiance else part.kind}_{len(self._objects)}"
-            shape: dict[str, Any] = {"type": part.kind, "to_world": matrix, "bsdf": part.material}
-            if part.mesh is not None:
-                shape["mesh"] = part.mesh
+            self._objects[name] = part.shape(matrix)
             if part.radiance is not None:
-                shape["emitter"] = {"type": "area", "radiance": rgb(part.radiance), "sampling_weight": 1.0}
                 self.lamps.append(name)
-            self._objects[name] = shape
             self._bounds.append(bounds(part.kind, matrix))
             names.append(name)
         if movable:
@@ -122,6 +127,21 @@ class SceneBuilder:
         """The Mitsuba dictionary of what is there; a shape of the type ``"mesh"`` holds its triangles."""
         sky = {} if self._sky is None else {"sky": self._sky}
         return {"type": "scene", **self._materials, **self._objects, **self._lights, **sky}
+
+
+def scene_of(parts: Mapping[str, Part]) -> dict[str, Any]:
+    """The Mitsuba dictionary of named parts, each with a material of its own."""
+    return {"type": "scene"} | {name: _plain(part.shape(part.to_group)) for name, part in parts.items()}
+
+
+def _plain(value: Any) -> Any:
+    """A description with colors and numbers in place of bitmaps of 2x2 pixels, which take longer to load."""
+    if not isinstance(value, Mapping):
+        return value
+    if value.get("type") == "bitmap" and value["bitmap"].shape[:2] == (2, 2):
+        pixel = value["bitmap"][0, 0]
+        return rgb(pixel) if len(pixel) == 3 else float(pixel[0])
+    return {key: _plain(item) for key, item in value.items()}
 
 
 def rgb(color: Color) -> dict[str, Any]:
@@ -157,18 +177,18 @@ def rotate(axis: str, degrees: float) -> Array:
     return matrix
 
 
-def box(center: Vector, size: Vector, material: dict[str, str], turn: float = 0, tilt: float = 0) -> Part:
+def box(center: Vector, size: Vector, material: Bsdf, turn: float = 0, tilt: float = 0) -> Part:
     """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
     half_size = [0.5 * length for length in size]
     return Part("cube", place(center, turn, half_size, rotate("x", tilt)), material)
 
 
-def ball(center: Vector, radius: float, material: dict[str, str], radiance: Color | None = None) -> Part:
+def ball(center: Vector, radius: float, material: Bsdf, radiance: Color | None = None) -> Part:
     """A sphere."""
     return Part("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
 
 
-def rod(start: Vector, end: Vector, radius: float, material: dict[str, str]) -> Part:
+def rod(start: Vector, end: Vector, radius: float, material: Bsdf) -> Part:
     """An open tube between two points."""
     axis = np.subtract(end, start, dtype=np.float64)
     length = float(np.linalg.norm(axis))
@@ -181,13 +201,13 @@ def rod(start: Vector, end: Vector, radius: float, material: dict[str, str]) -> 
     return Part("cylinder", matrix, material)
 
 
-def drum(foot: Vector, height: float, radius: float, material: dict[str, str]) -> list[Part]:
+def drum(foot: Vector, height: float, radius: float, material: Bsdf) -> list[Part]:
     """An upright cylinder with caps."""
     top = (foot[0], foot[1] + height, foot[2])
     return [rod(foot, top, radius, material), plate(top, radius, material), plate(foot, radius, material, up=False)]
 
 
-def plate(center: Vector, radius: float, material: dict[str, str], up: bool = True) -> Part:
+def plate(center: Vector, radius: float, material: Bsdf, up: bool = True) -> Part:
     """A horizontal disc."""
     return Part("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
 
@@ -195,7 +215,7 @@ def plate(center: Vector, radius: float, material: dict[str, str], up: bool = Tr
 def sheet(
     center: Vector,
     half_size: Vector,
-    material: dict[str, str],
+    material: Bsdf,
     rotation: Array,
     radiance: Color | None = None,
 ) -> Part:

@@ -181,6 +181,11 @@ def leaf_mask(rng: np.random.Generator) -> Array:
     return np.asarray(mask[..., None] * 1.0)
 
 
+def tint(brightness: Array, color: Color) -> Array:
+    """A texture of one color with varying brightness, ``(H, W, 3)`` in 0 to 0.9."""
+    return np.asarray(np.clip(brightness[..., None] * np.array(color), 0, 0.9))
+
+
 def _grid(side: int) -> tuple[Array, Array]:
     y, x = np.mgrid[0:side, 0:side] / side
     return y, x
