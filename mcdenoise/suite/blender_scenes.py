@@ -1,25 +1,21 @@
-"""Scenes of the suite for Blender's Cycles, rendered to multilayer EXR files with every pass.
+"""Scenes of the suite for Blender's Cycles, made of its own primitives and textures.
 
-    python blender_scenes.py job.json
-
-This script is self-contained: apart from the standard library it imports only Blender's Python module ``bpy``, which is
-under the GPL (``pip install bpy==4.5.15``, Python 3.11; it needs no display). The job file names the scene, its
-settings and the images to render, see :func:`main`; :mod:`mcdenoise.suite.rendering` writes it.
+:mod:`mcdenoise.scenes.cycles.blender` runs this script in Blender's Python, and renders what one of its functions has
+built. Apart from the standard library and numpy it imports only Blender's module ``bpy``, which is under the GPL.
 
 ``gallery`` has lacquered planks, a brick wall, brushed steel, glass, a mirror, a lamp, a page of marks, thin rods, and
 a head that moves. ``garden`` is outdoors under the sun and an HDR sky, with grass, a fence, lacquer and a glass ball.
-``attic`` is a room of diffuse objects only, lit through a window.
+``attic`` is a room of diffuse objects only, lit through a window. Each returns its :func:`camera`.
 """
 
 from __future__ import annotations
 
 import importlib
-import json
 import math
-import os
 import random
-import sys
 from typing import Any
+
+import numpy as np
 
 bpy: Any
 try:
@@ -27,62 +23,11 @@ try:
 except ImportError:  # The Python that runs mcdenoise does not need bpy.
     bpy = None
 
-PASSES: tuple[str, ...] = ("z", "position", "normal", "vector", "emit", "environment")
-PASSES += tuple(f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color"))
 Color = tuple[float, float, float]
+_FOCUS, _STOP = 5.2, 0.35
 
 
-def main() -> None:
-    """Read the job and render it.
-
-    Its keys are ``scene``, ``size``, ``frames``, ``filter`` (``"default"`` or ``"centre"``), ``lens``, ``blur``,
-    ``threads``, and ``images``: a list of objects with ``frame``, ``samples``, ``seed``, ``passes`` and ``out``. A file
-    gets its final name once it is complete.
-    """
-    with open(sys.argv[1], encoding="utf-8") as file:
-        job = json.load(file)
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    {"gallery": gallery, "garden": garden, "attic": attic}[job["scene"]](job["frames"])
-    set_up(scene, job)
-    for image in job["images"]:
-        layer = scene.view_layers[0]
-        for name in PASSES:
-            setattr(layer, f"use_pass_{name}", image["passes"])
-        layer.cycles.denoising_store_passes = image["passes"]
-        scene.cycles.samples, scene.cycles.seed = image["samples"], image["seed"]
-        scene.frame_set(image["frame"])
-        unfinished = f"{image['out']}.{os.getpid()}.exr"
-        scene.render.filepath = unfinished
-        bpy.ops.render.render(write_still=True)
-        os.replace(unfinished, image["out"])
-
-
-def set_up(scene: Any, job: dict[str, Any]) -> None:
-    """Apply the render settings and the output format."""
-    scene.render.engine = "CYCLES"
-    scene.frame_start, scene.frame_end = 0, job["frames"] - 1
-    scene.render.resolution_x, scene.render.resolution_y = job["size"]
-    scene.render.resolution_percentage = 100
-    if job["threads"]:
-        scene.render.threads_mode, scene.render.threads = "FIXED", job["threads"]
-    scene.render.use_motion_blur = job["blur"]
-    scene.camera.data.dof.use_dof = job["lens"]
-    cycles = scene.cycles
-    cycles.device = "CPU"
-    cycles.use_adaptive_sampling = cycles.use_denoising = False
-    # In Cycles the width does not apply to a box filter, so the narrow filter is a Blackman-Harris filter too.
-    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
-    cycles.filter_width = 0.01 if job["filter"] == "centre" else 1.5
-    settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0):
-        settings.media_type = "MULTI_LAYER_IMAGE"
-        settings.use_exr_interleave = True
-    settings.file_format = "OPEN_EXR_MULTILAYER"
-    settings.exr_codec, settings.color_depth = "ZIP", "32"
-
-
-def gallery(frames: int) -> None:
+def gallery(frames: int) -> dict[str, Any]:
     """An interior of glossy objects with a little sky light."""
     sky(24, 160, 0.05)
     plane("Floor", (0, 0, 0), (0, 0, 0), (12, 12), planks())
@@ -104,10 +49,12 @@ def gallery(frames: int) -> None:
     head = finish("Head", matt("Clay", (0.18, 0.4, 0.62)))
     head.modifiers.new("Smooth", "SUBSURF").render_levels = 2
     path(head, frames, lambda step: (-1.9 + 0.13 * step, -0.2 - 0.03 * step, 0.56))
-    camera(frames, 30, lambda step: (0.5 - 0.12 * step, -5.0 + 0.06 * step, 1.55 + 0.03 * step), (0.0, 0.9, 0.95))
+    return camera(
+        frames, 30, lambda step: (0.5 - 0.12 * step, -5.0 + 0.06 * step, 1.55 + 0.03 * step), (0.0, 0.9, 0.95)
+    )
 
 
-def garden(frames: int) -> None:
+def garden(frames: int) -> dict[str, Any]:
     """An outdoor scene with a bright sun, sharp shadows and thin objects."""
     sky(34, 130, 0.09)
     rng = random.Random(5)
@@ -137,10 +84,10 @@ def garden(frames: int) -> None:
     head = finish("Head", coat("Blue", (0.02, 0.08, 0.35)))
     head.modifiers.new("Smooth", "SUBSURF").render_levels = 2
     path(head, frames, lambda step: (2.6 - 0.12 * step, -0.2, 0.6))
-    camera(frames, 32, lambda step: (-0.8 + 0.14 * step, -5.6, 1.5), (0.1, 0.8, 0.75))
+    return camera(frames, 32, lambda step: (-0.8 + 0.14 * step, -5.6, 1.5), (0.1, 0.8, 0.75))
 
 
-def attic(frames: int) -> None:
+def attic(frames: int) -> dict[str, Any]:
     """A closed room of diffuse objects; light from the window reaches most of it after several bounces."""
     sky(30, 60, 0.16)
     plaster = matt("Plaster", (0.72, 0.68, 0.6))
@@ -173,24 +120,28 @@ def attic(frames: int) -> None:
     bpy.ops.mesh.primitive_monkey_add(size=0.9, location=(0.6, -0.6, 0.5), rotation=(0, 0, math.radians(-15)))
     head = finish("Head", matt("Clay", (0.72, 0.3, 0.15)))
     path(head, frames, lambda step: (0.6 - 0.1 * step, -0.6, 0.5))
-    camera(frames, 24, lambda step: (-0.3 + 0.08 * step, -2.85, 1.35), (0.0, 0.9, 0.8))
+    return camera(frames, 24, lambda step: (-0.3 + 0.08 * step, -2.85, 1.35), (0.0, 0.9, 0.8))
 
 
-def camera(frames: int, lens: float, place: Any, target: Color) -> None:
-    """Add a camera that moves along a path and looks at one point."""
-    data = bpy.data.cameras.new("Camera")
-    thing = bpy.data.objects.new("Camera", data)
-    scene = bpy.context.scene
-    scene.collection.objects.link(thing)
-    scene.camera = thing
-    focus = bpy.data.objects.new("Target", None)
-    focus.location = target
-    scene.collection.objects.link(focus)
-    aim = thing.constraints.new("TRACK_TO")
-    aim.target, aim.track_axis, aim.up_axis = focus, "TRACK_NEGATIVE_Z", "UP_Y"
-    data.lens, data.clip_end = lens, 1000
-    data.dof.focus_distance, data.dof.aperture_fstop = 5.2, 0.35
-    path(thing, frames, place)
+def camera(frames: int, lens: float, place: Any, target: Color) -> dict[str, Any]:
+    """A camera that moves along a path and looks at one point: settings of ``build`` in Blender's script.
+
+    Args:
+        frames: number of frames; there are poses from one before the first to one after the last.
+        lens: focal length in millimetres, for a sensor of 36.
+        place: gives the location of each frame.
+        target: the point.
+    """
+    poses = []
+    for step in range(-1, frames + 1):
+        forward = np.subtract(target, place(step))
+        left = np.cross((0, 0, 1), forward)
+        pose = np.eye(4)
+        pose[:3] = np.stack([left, np.cross(forward, left), forward, place(step)], 1)
+        pose[:, :3] /= np.linalg.norm(pose[:, :3], axis=0)
+        poses.append(pose)
+    fov = math.degrees(2 * math.atan(18 / lens))
+    return {"cameras": poses, "fov_x": [fov] * len(poses), "aperture": lens * 1e-3 / (2 * _STOP), "focus": _FOCUS}
 
 
 def path(thing: Any, frames: int, place: Any) -> None:
@@ -352,7 +303,3 @@ def sky(elevation: float, rotation: float, strength: float) -> None:
     node.sun_size, node.sun_intensity = math.radians(1.5), 0.5
     tree.links.new(node.outputs["Color"], tree.nodes["Background"].inputs["Color"])
     tree.nodes["Background"].inputs["Strength"].default_value = strength
-
-
-if __name__ == "__main__":
-    main()

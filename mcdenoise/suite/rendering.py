@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,13 +30,15 @@ _PARTS = 8
 _FRACTIONS = (0.25, 1.0)
 _SEED, _REFERENCE_SEED = 77, 1_000_000
 _LENS, _FOCUS = 0.03, 3.4
+# Passes of the noisy images in Cycles, by their names in Blender's Python; references need none.
+_PASSES = ["z", "position", "normal", "vector", "emit", "environment"]
+_PASSES += [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
 
 
 def render_suite(
     shots: Iterable[Shot],
     data: Path,
     *,
-    blender_python: Path | None = None,
     threads: int = 0,
     on_step: Callable[[str, float, int, int], None] = lambda shot, fraction, done, total: None,
 ) -> None:
@@ -47,8 +47,6 @@ def render_suite(
     Args:
         shots: shots in the order of rendering. All references get a quarter of their samples first, and then the rest.
         data: the folder; a shot's files go to ``data/NAME``.
-        blender_python: a Python interpreter that can import ``bpy``, for the shots of Cycles; by default as in
-            :class:`mcdenoise.scenes.cycles.Blender`.
         threads: number of threads for Cycles; 0 uses all processors.
         on_step: called before each step with the name of the shot, the fraction of its reference samples that will be
             there, and the numbers of finished and of all steps.
@@ -57,21 +55,23 @@ def render_suite(
         InputError: a renderer is missing or failed, or the folder cannot be written or holds other files.
     """
     shots = list(shots)
-    if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
-        # Find Blender before the hours that Mitsuba takes.
-        with Blender(blender_python) as blender:
-            blender_python = blender.python
-    try:
-        data.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{data}: cannot be created ({error.strerror}); choose another folder with --data") from error
     steps = [(fraction, shot) for fraction in _FRACTIONS for shot in shots]
-    for number, (fraction, shot) in enumerate(steps):
-        on_step(shot.name, fraction, number, len(steps))
-        if shot.renderer == "mitsuba":
-            _render_mitsuba(shot, data, fraction)
-        else:
-            _render_cycles(shot, data, fraction, blender_python, threads)
+    with ExitStack() as stack:
+        blender = None
+        if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
+            # Before the hours that Mitsuba takes.
+            blender = stack.enter_context(Blender())
+        try:
+            data.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = f"cannot be created ({error.strerror})"
+            raise InputError(f"{data}: {reason}; choose another folder with --data") from error
+        for number, (fraction, shot) in enumerate(steps):
+            on_step(shot.name, fraction, number, len(steps))
+            if shot.renderer == "mitsuba":
+                _render_mitsuba(shot, data, fraction)
+            else:
+                _render_cycles(shot, data, fraction, blender, threads)
 
 
 def rows_there(rows: Iterable[Row], data: Path) -> list[Row]:
@@ -140,7 +140,7 @@ def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, 
 
 def _take_references(shot: Shot, data: Path) -> None:
     """Copy the references of the first shot with the same picture, instead of rendering them again."""
-    first = next((other for other in SHOTS if other.picture == shot.picture), shot)
+    first = _first(shot)
     if first == shot:
         return
     for number in shot.references:
@@ -152,20 +152,19 @@ def _take_references(shot: Shot, data: Path) -> None:
                 shutil.copyfile(source, unfinished)
 
 
-def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path | None, threads: int) -> None:
+def _render_cycles(shot: Shot, data: Path, fraction: float, blender: Blender | None, threads: int) -> None:
     folder, parts = data / shot.name, _parts_of(shot, data)
     for each in (folder, parts):
         each.mkdir(parents=True, exist_ok=True)
-    images = [_image(n, shot.samples, _SEED + n, folder / _shot_file(n), passes=True) for n in range(shot.frames)]
+    noisy = {folder / _shot_file(n): (n, shot.samples, _SEED + n) for n in range(shot.frames)}
     samples = max(shot.reference_samples // _PARTS, 1)
-    wanted = range(max(round(_PARTS * fraction), 2))
-    for part in wanted:
-        for n in shot.references:
-            seed = _REFERENCE_SEED + 1000 * part + n
-            images.append(_image(n, samples, seed, _part(parts, part, n), passes=False))
-    missing = [image for image in images if not Path(image["out"]).is_file()]
-    if missing and python is not None:
-        _run_blender(shot, missing, python, threads)
+    clean = {
+        _part(parts, part, n): (n, samples, _REFERENCE_SEED + 1000 * part + n)
+        for part in range(max(round(_PARTS * fraction), 2))
+        for n in shot.references
+    }
+    _render_missing(shot, noisy, blender, threads, _PASSES)
+    _render_missing(shot, clean, blender, threads, [])
     noise = {}
     for n in shot.references:
         found = [path for k in range(_PARTS) if (path := _part(parts, k, n)).is_file()]
@@ -173,21 +172,21 @@ def _render_cycles(shot: Shot, data: Path, fraction: float, python: Path | None,
     write_json(folder / "camera.json", {"reference_noise": noise})
 
 
-def _image(frame: int, samples: int, seed: int, out: Path, *, passes: bool) -> dict[str, Any]:
-    return {"frame": frame, "samples": samples, "seed": seed, "passes": passes, "out": str(out.absolute())}
-
-
-def _run_blender(shot: Shot, images: list[dict[str, Any]], python: Path, threads: int) -> None:
-    job = asdict(shot) | {"threads": threads, "images": images}
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "job.json"
-        path.write_text(json.dumps(job))
-        # With -P, Python does not import the modules beside the script.
-        command = [str(python), "-P", str(_SCRIPT), str(path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode or not all(Path(image["out"]).is_file() for image in images):
-        messages = [line for line in done.stderr.splitlines() if line.strip()] or ["it ended without a message"]
-        raise InputError(f"{shot.name}: Blender could not render it: {messages[-1].strip()}")
+def _render_missing(
+    shot: Shot, images: dict[Path, tuple[int, int, int]], blender: Blender | None, threads: int, passes: list[str]
+) -> None:
+    """Render the images that are missing, each of a frame, with a number of samples and a seed."""
+    missing = {path: image for path, image in images.items() if not path.is_file()}
+    if not missing or blender is None:
+        return
+    settings = {"size": shot.size, "threads": threads, "box": False, "passes": passes, "clamped": True}
+    # In Cycles the width does not apply to a box filter, so the narrow filter is a Blackman-Harris filter too.
+    settings |= {"filter_width": 0.01 if shot.filter == "centre" else 1.5, "shutter": 0.5 if shot.blur else 0.0}
+    settings |= {} if shot.lens else {"aperture": 0.0}
+    blender.ask("script", script=str(_SCRIPT), name=shot.scene, frames=shot.frames, settings=settings)
+    for path, (frame, samples, seed) in missing.items():
+        with atomic_path(path) as unfinished:
+            blender.ask("render", frame=frame, samples=samples, seed=seed, out=str(unfinished.absolute()))
 
 
 def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
@@ -208,8 +207,12 @@ def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
 
 def _parts_of(shot: Shot, data: Path) -> Path:
     """Folder with the parts of the references, which shots with the same picture share."""
-    first = next((other for other in SHOTS if other.picture == shot.picture), shot)
-    return data / ".parts" / first.name
+    return data / ".parts" / _first(shot).name
+
+
+def _first(shot: Shot) -> Shot:
+    """The first shot with the same picture."""
+    return next((other for other in SHOTS if other.picture == shot.picture), shot)
 
 
 def _part(folder: Path, part: int, frame: int) -> Path:

@@ -11,6 +11,7 @@ import importlib
 import json
 import math
 import os
+import runpy
 import sys
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ def main() -> None:
         print(json.dumps({"error": "there is no module 'bpy'"}), file=answers, flush=True)
         return
     print(json.dumps({"ok": bpy.app.version_string}), file=answers, flush=True)
-    commands: dict[str, Any] = {"scene": build, "render": render}
+    commands: dict[str, Any] = {"scene": build, "script": build_by, "render": render}
     for line in sys.stdin:
         command = json.loads(line)
         try:
@@ -54,7 +55,8 @@ def build(folder: str, settings: dict[str, Any]) -> None:
     Args:
         folder: folder of the files.
         settings: ``size``, ``threads``, ``filter_width``, ``box``; ``cameras``, ``fov_x`` and ``moves`` for every
-            frame, from one before the first to one after the last; ``aperture`` (radius) and ``focus``; ``shutter``.
+            frame, from one before the first to one after the last; ``aperture`` (radius) and ``focus``; ``shutter``;
+            ``passes``, by their names in Blender's Python; ``clamped``, whether Cycles clamps and thresholds light.
     """
     content = json.loads((Path(folder) / "scene.json").read_text(encoding="utf-8"))
     with np.load(Path(folder) / "scene.npz", allow_pickle=False) as file:
@@ -73,6 +75,19 @@ def build(folder: str, settings: dict[str, Any]) -> None:
         scene.collection.objects.link(_light(number, light))
     scene.world = _world(content["sky"], images)
     _set_up(scene, settings)
+
+
+def build_by(script: str, name: str, frames: int, settings: dict[str, Any]) -> None:
+    """Build a scene by a function of another script, which gets the number of frames and returns the camera's settings.
+
+    Args:
+        script: path of the script.
+        name: of the function.
+        frames: number of frames.
+        settings: see :func:`build`; those of the camera are the function's but for ``aperture``, if it is 0.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    _set_up(bpy.context.scene, runpy.run_path(script)[name](frames) | settings)
 
 
 def render(frame: int, samples: int, seed: int, out: str) -> None:
@@ -100,15 +115,17 @@ def _set_up(scene: Any, settings: dict[str, Any]) -> None:
     if settings["threads"]:
         scene.render.threads_mode, scene.render.threads = "FIXED", settings["threads"]
     layer = scene.view_layers[0]
-    layer.cycles.denoising_store_passes = True
-    for name in ("z", "position", "object_index", *settings["passes"]):
+    layer.cycles.denoising_store_passes = bool(settings["passes"])
+    layer.use_pass_z = False
+    for name in settings["passes"]:
         setattr(layer, f"use_pass_{name}", True)
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
-    # A brightness threshold would make the result depend on the unit of radiance.
-    cycles.light_sampling_threshold = 0
+    if not settings["clamped"]:
+        cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
+        # A brightness threshold would make the result depend on the unit of radiance.
+        cycles.light_sampling_threshold = 0
     # A box filter in Cycles is always one pixel wide, so the narrow filter has the default type.
     cycles.pixel_filter_type = "BOX" if settings["box"] else "BLACKMAN_HARRIS"
     cycles.filter_width = settings["filter_width"]

@@ -155,7 +155,8 @@ def render_cycles(
         if noisy or clean:
             description.save(Path(place))
             settings |= _for_blender(take, {name: moves[name] for name in movers})
-            settings |= {"size": list(size), "threads": threads, "passes": _LIGHT if parts else []}
+            passes = ["z", "position", "object_index", *(_LIGHT if parts else [])]
+            settings |= {"size": list(size), "threads": threads, "passes": passes, "clamped": False}
             settings |= {"box": used == "box", "filter_width": _WIDTHS[used]}
             blender.ask("scene", folder=place, settings=settings)
 
