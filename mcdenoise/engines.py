@@ -97,6 +97,36 @@ def run_jobs(engine: Engine, jobs: Iterable[Job], on_wait: Callable[[], object] 
             on_wait()
 
 
+def run_tasks(
+    engine: Engine,
+    function: Callable[..., Any],
+    calls: Iterable[tuple[Any, ...]],
+    on_answer: Callable[[tuple[Any, ...], Any], object],
+) -> list[tuple[tuple[Any, ...], str]]:
+    """Call a function once for each tuple of arguments, each call a task of its own; closes the engine at the end.
+
+    Args:
+        engine: runs the calls.
+        function: of a module that workers can import.
+        calls: the arguments of each call.
+        on_answer: called with the arguments and the answer of a call that did not fail.
+
+    Returns:
+        The arguments of the calls that failed, and why.
+    """
+    failed: list[tuple[tuple[Any, ...], str]] = []
+
+    def one(arguments: tuple[Any, ...]) -> Job:
+        [(answer, reason)] = yield [Task(function, arguments)]
+        if reason is None:
+            on_answer(arguments, answer)
+        else:
+            failed.append((arguments, reason))
+
+    run_jobs(engine, map(one, calls))
+    return failed
+
+
 @dataclass(order=True)
 class _Attempt:
     """A task, its job, and the outcomes of the tasks that were yielded together; in the order of their start."""

@@ -14,7 +14,7 @@ from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.engines import Job, RayEngine, Task, parse_workers, run_jobs
+from mcdenoise.engines import RayEngine, parse_workers, run_tasks
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, default_folder, open_assets
 from mcdenoise.scenes.generation import SequencePlan
@@ -142,21 +142,16 @@ def _on_ray(plan: TakePlan | SequencePlan, seeds: list[int], address: str, out: 
         # One variant for all machines, because it is part of the identity of a sequence.
         variant = "" if plan.cycles else choose_variant(plan.rendering["variant"])
         plan = replace(plan, threads=threads, rendering={**plan.rendering, "variant": variant or None})
-    folder, failed = plan.out, list[dict[str, str]]()
     engine = RayEngine(address, cpus=threads, gpus=float(variant.startswith("cuda")))
     with progress_bar() as progress:
         scenes = progress.add_task("scenes", total=len(seeds))
 
-        def one(seed: int) -> Job:
-            [(written, reason)] = yield [Task(render_seed, (plan, seed))]
-            if reason is None:
-                progress.advance(scenes)
-                say(out / written.relative_to(folder))
-            else:
-                failed.append({"scene": f"seed {seed}", "failed": reason})
+        def finish(call: tuple[TakePlan | SequencePlan, int], written: Path) -> None:
+            progress.advance(scenes)
+            say(out / written.relative_to(call[0].out))
 
-        run_jobs(engine, map(one, seeds))
-    print_rows(failed)
+        failed = run_tasks(engine, render_seed, [(plan, seed) for seed in seeds], finish)
+    print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
     return 1 if failed else None
 
 
