@@ -137,23 +137,3 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
     render("a")
     with pytest.raises(InputError, match=r"film .*'box'.*, .*None"):
         render("a", film=None)
-
-
-def test_previous_positions_of_what_moves(tmp_path: Path) -> None:
-    """The ball moves along x, and is tested where it is seen for sure; the wall stands still."""
-    ball = np.diag((0.4, 0.4, 0.4, 1.0))
-    ball[2, 3] = 0.6
-    scene = wall() | {"ball": {"type": "sphere", "to_world": ball, "bsdf": {"type": "diffuse"}}}
-    moved = np.tile(np.eye(4), (2, 1, 1))
-    moved[1, 0, 3] = 0.1
-    folder = render_sequence(
-        scene, AT_WALL * 2, tmp_path, moves={"ball": moved}, reference_spp=1, film=Film("box"), **SCALAR
-    )
-    position, before = read(folder, "world_position1"), read(folder, "previous_position1")
-    on_ball, on_wall = position[..., 2] > 0.7, np.abs(position[..., 2]) < 1e-4
-    assert on_ball.sum() > 5
-    assert on_wall.sum() > 50
-    np.testing.assert_allclose((position - before)[on_ball], np.tile((0.1, 0, 0), (on_ball.sum(), 1)), atol=1e-5)
-    np.testing.assert_allclose(before[on_wall], position[on_wall], atol=1e-5)
-    first = read(folder, "previous_position0")
-    np.testing.assert_allclose(first, read(folder, "world_position0"), atol=1e-5)

@@ -190,7 +190,7 @@ def test_modules_of_the_working_folder_are_not_imported(line: str, here: Path, s
 
 def test_native_code_beside_a_scene_is_not_loaded(here: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    from mcdenoise.scenes.render.tracer import Tracer
+    from mcdenoise.scenes.render.stage import Stage
 
     (here / "plugins").mkdir()
     for suffix in (".so", ".dylib", ".dll"):
@@ -198,9 +198,9 @@ def test_native_code_beside_a_scene_is_not_loaded(here: Path) -> None:
     scene = '<scene version="3.0.0">{}<shape type="rectangle"><bsdf type="diffuse"/></shape></scene>'
     (here / "elsewhere").mkdir()
     (here / "elsewhere/scene.xml").write_text(scene.format(""))
-    Tracer(here / "elsewhere/scene.xml", "scalar_rgb", 2)
+    Stage(here / "elsewhere/scene.xml", "scalar_rgb")
     (here / "scene.xml").write_text(scene.format(""))
     (here / "elsewhere/other.xml").write_text(scene.format(f'<path value="{here}"/>'))
     for place in ("scene.xml", "elsewhere/other.xml"):
         with pytest.raises(InputError, match="plug-ins"):
-            Tracer(here / place, "scalar_rgb", 2)
+            Stage(here / place, "scalar_rgb")

@@ -15,20 +15,12 @@ from mcdenoise.data.camera_path import Camera
 from mcdenoise.data.shards import find_shards, open_shard
 from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.random.materials import diffuse, glass
+from mcdenoise.scenes.render.film import curve, offsets, splat
 from mcdenoise.scenes.takes.draw import Take, draw_take
-from mcdenoise.scenes.takes.filters import curve, offsets, splat
 
 NOTHING = Assets(Path("nowhere"))
 SIZE = 24, 16
 FOV = 50.0
-
-
-def test_a_number_is_one_take() -> None:
-    first, again, other = draw_take(5, NOTHING), draw_take(5, NOTHING), draw_take(6, NOTHING)
-    assert first.settings == again.settings
-    assert first.scene.keys() == again.scene.keys()
-    assert all(np.array_equal(a.to_world, b.to_world) for a, b in zip(first.cameras, again.cameras, strict=True))
-    assert first.scene.keys() != other.scene.keys() or first.settings != other.settings
 
 
 def test_numbers_draw_stills_clips_and_every_kind_of_sampling() -> None:

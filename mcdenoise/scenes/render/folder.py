@@ -57,8 +57,6 @@ BY_MITSUBA: dict[str, Any] = {
 ON_A_FILM: dict[str, Any] = {
     "pixel_sampling": "jittered samples through the pixel filter and the lens of 'film'; features are means over the "
     "samples of their color, and each folder noise_seed{1,2,...} has its own",
-    "albedo": "Mitsuba's aov, clamped to [0, 1]",
-    "alpha_masks": "features are of the first surface, be it see-through",
     "shading_normal": "world space, turned to the side the camera sees, averaged and not normalised",
 }
 # Frames rendered with different values of these settings must not be in one folder.
@@ -131,14 +129,15 @@ class SequenceFolder:
         )
         write_camera_matrices(self.path / "camera_matrices.h", matrices, _ALWAYS["conventions"]["camera_matrices"])
 
-    def note_reference(self, number: int, state: ReferenceState) -> None:
-        """Record the progress of a reference in ``camera.json``.
+    def note_reference(self, number: int, state: ReferenceState | None) -> None:
+        """Record the progress of a reference, if there is any, in ``camera.json``.
 
         Raises:
             InputError: the file cannot be written.
         """
-        self.references[number] = state
-        self._write()
+        if state is not None:
+            self.references[number] = state
+            self._write()
 
     def _read(self, settings: dict[str, Any]) -> dict[str, Any]:
         described = self._description

@@ -5,21 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import torch
 
-from mcdenoise.data.camera_path import Array, Camera, PixelRays, pixel_rays
+from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.samples import FEATURES
-from mcdenoise.scenes.render.film import Film, FilmRenderer
+from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
+from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_noisy, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.loading import Scene
-from mcdenoise.scenes.render.tracer import STRATIFIED_PATHS, Tracer
+from mcdenoise.scenes.render.stage import Stage
 
 # With fewer paths, rare bright ones have not been hit yet, and the noise is underestimated.
 _FEWEST_PATHS_IN_A_HALF = 16
@@ -28,9 +28,7 @@ _SECONDS_BETWEEN_SAVES = 60.0
 # Number of samples of a reference's features, and a seed number that its passes do not use.
 _CLEAN_PATHS, _CLEAN_STREAM = 16, 2**20
 # The last scene that this worker has loaded, by the folder of its frames: a folder has one scene.
-_loaded: dict[Path, Tracer] = {}
-
-Seed: TypeAlias = tuple[int, ...]
+_loaded: dict[Path, SequenceTracer] = {}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,11 +106,14 @@ def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:
     """A task: :func:`render_frame` by the scene that this worker has loaded, if it is the same."""
     if job.folder not in _loaded:
         _loaded.clear()
-        _loaded[job.folder] = Tracer(job.scene, job.variant, job.max_depth, job.moves)
+        stage = Stage(job.scene, job.variant, job.moves)
+        _loaded[job.folder] = SequenceTracer(stage, job.cameras, job.size, job.film, job.max_depth, job.reach)
     return render_frame(job, _loaded[job.folder], number, lambda paths: None)
 
 
-def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[int], None]) -> ReferenceState | None:
+def render_frame(
+    job: FrameJob, tracer: SequenceTracer, number: int, advance: Callable[[int], None]
+) -> ReferenceState | None:
     """Write the missing files of a frame. The first color is last: a frame that has it is complete.
 
     On a film, every noise seed has the features of its own samples.
@@ -130,82 +131,51 @@ def render_frame(job: FrameJob, tracer: Tracer, number: int, advance: Callable[[
         InputError: a file cannot be written, or the unfinished reference is damaged.
     """
     tracer.place(number)
-    camera, back = job.cameras[number], _moved_back(job, number)
-    rays = pixel_rays(camera, *job.size)
-    film = None if job.film is None else FilmRenderer(tracer, job.film, job.size, job.reach)
-    if film is None and not job.has(number, 0, job.features):
-        for name, values in _features(job, tracer, number, rays, back).items():
-            write_buffer(job.folder, number, name, _image(values, job.size))
+    if job.film is None and not job.has(number, 0, job.features):
+        found = tracer.features(number)
+        for name in job.features:
+            write_buffer(job.folder, number, name, _image(found[name], job.size))
     state = None
     if job.wants_reference(number):
-        trace = partial(tracer.radiance, rays) if film is None else partial(film.radiance, camera)
-        state = _refine_reference(job, trace, number, advance)
-        if film is not None:
-            clean = film.frame(camera, {}, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
+        state = _refine_reference(job, tracer, number, advance)
+        if job.film is not None:
+            clean = tracer.frame(number, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
             write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
-    per_pass = min(job.spp, tracer.paths_per_pass(rays) if film is None else film.paths_per_pass())
-
-    def noisy(paths: int, seed: Seed) -> dict[str, Array]:
-        if film is None:
-            return {"color": tracer.radiance(rays, paths, seed, False)}
-        return film.frame(camera, {name: back[name] for name in tracer.movers}, paths, seed)
-
     for noise_seed in reversed(range(job.noise_seeds)):
-        if job.has(number, noise_seed, job.noisy):
-            continue
-        total: dict[str, Any] = {}
-        kept: list[torch.Tensor] = []
-        # The stream 1 belongs to the reference.
-        seed = (job.seed, number, 1 + noise_seed if noise_seed else 0)
-        for index, start in enumerate(range(0, job.spp, 1 if job.keep_samples else per_pass)):
-            paths = 1 if job.keep_samples else min(per_pass, job.spp - start)
-            found = noisy(paths, (*seed, index))
-            for name, values in found.items():
-                total[name] = total.get(name, 0) + paths * values
-            if job.keep_samples:
-                names = [name for name in ("color", *FEATURES) if name in found]
-                kept.append(torch.cat([_image(found[name], job.size) for name in names], 1))
-            advance(paths)
-        color = _image(total.pop("color") / job.spp, job.size)
-        images = {name: _image(total[name] / job.spp, job.size) for name in sorted(total)}
-        images |= {"samples": torch.stack(kept, 1)} if kept else {}
-        write_noisy(job.folder, number, noise_seed, {**images, "color": color})
+        if not job.has(number, noise_seed, job.noisy):
+            _render_noisy(job, tracer, number, noise_seed, advance)
     return state
 
 
-def _features(job: FrameJob, tracer: Tracer, number: int, rays: PixelRays, back: dict[str, Array]) -> dict[str, Array]:
-    hits = tracer.features(rays)
-    position = rays.origin + np.minimum(hits.distance, job.reach)[:, None] * rays.directions
-    depth = (position - rays.origin) @ job.cameras[number].to_world[:3, 2]
-    features = {"albedo": hits.albedo, "normal": hits.normal, "position": position, "depth": depth}
-    if job.moves:
-        before = position.copy()
-        for index, identity in enumerate(tracer.movers):
-            hit = hits.mover == index
-            before[hit] = position[hit] @ back[identity][:3, :3].T + back[identity][:3, 3]
-        features["previous_position"] = before
-    return features
-
-
-def _moved_back(job: FrameJob, number: int) -> dict[str, Array]:
-    """For each moving object, the ``(4, 4)`` transform of its points to the previous frame."""
-    # The first frame has no previous one; the transform to itself is the identity.
-    earlier = max(number - 1, 0)
-    return {
-        name: np.eye(4)
-        if np.array_equal(moved[earlier], moved[number])
-        else moved[earlier] @ np.linalg.inv(moved[number])
-        for name, moved in job.moves.items()
-    }
+def _render_noisy(
+    job: FrameJob, tracer: SequenceTracer, number: int, noise_seed: int, advance: Callable[[int], None]
+) -> None:
+    """Write a noisy color, and on a film its features."""
+    per_pass = 1 if job.keep_samples else min(job.spp, tracer.paths_per_pass)
+    total: dict[str, Any] = {}
+    kept: list[torch.Tensor] = []
+    for index, start in enumerate(range(0, job.spp, per_pass)):
+        paths = min(per_pass, job.spp - start)
+        # The stream 1 belongs to the reference.
+        seed = (job.seed, number, 1 + noise_seed if noise_seed else 0, index)
+        found = (
+            {"color": tracer.radiance(number, paths, seed)} if job.film is None else tracer.frame(number, paths, seed)
+        )
+        for name, values in found.items():
+            total[name] = total.get(name, 0) + paths * values
+        if job.keep_samples:
+            names = [name for name in ("color", *FEATURES) if name in found]
+            kept.append(torch.cat([_image(found[name], job.size) for name in names], 1))
+        advance(paths)
+    # The color is written last.
+    images = {name: _image(total[name] / job.spp, job.size) for name in sorted(total, key="color".__eq__)}
+    write_noisy(job.folder, number, noise_seed, ({"samples": torch.stack(kept, 1)} if kept else {}) | images)
 
 
 def _refine_reference(
-    job: FrameJob, trace: Callable[[int, Seed, bool], Array], number: int, advance: Callable[[int], None]
+    job: FrameJob, tracer: SequenceTracer, number: int, advance: Callable[[int], None]
 ) -> ReferenceState:
-    """Add passes to a reference until it is finished, and write it.
-
-    ``trace`` returns the mean radiance of a number of paths per pixel for a seed, stratified or independent.
-    """
+    """Add passes to a reference until it is finished, and write it."""
     unfinished = job.folder / f"reference{number}.partial.npz"
     before = job.started.get(number, ReferenceState(0, 0, None))
     if unfinished.is_file():
@@ -222,7 +192,7 @@ def _refine_reference(
         rest = missing if halves.passes else (missing + 1) // 2
         paths = STRATIFIED_PATHS if stratified else rest
         seed = (job.seed, number, 1, halves.passes)
-        halves.add(trace(paths, seed, stratified), paths)
+        halves.add(tracer.radiance(number, paths, seed, stratified), paths)
         advance(paths)
         if time.monotonic() - saved > _SECONDS_BETWEEN_SAVES:
             halves.save(unfinished)

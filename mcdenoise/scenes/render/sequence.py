@@ -14,14 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
-from mcdenoise.engines import Engine, Job, LocalEngine, Task, run_jobs
+from mcdenoise.data.camera_path import Array, Camera, check_moves
+from mcdenoise.engines import Engine, LocalEngine, run_tasks
 from mcdenoise.errors import InputError
+from mcdenoise.scenes.render.features import RR_DEPTH, STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder, describe
 from mcdenoise.scenes.render.frames import FrameJob, render_frame, render_frame_task
 from mcdenoise.scenes.render.loading import Scene, choose_variant
-from mcdenoise.scenes.render.tracer import RR_DEPTH, STRATIFIED_PATHS, Tracer
+from mcdenoise.scenes.render.stage import Stage
 
 _LARGEST_SIDE = 16384
 
@@ -79,8 +80,8 @@ def render_sequence(
         variant: one of ``VARIANTS``; by default the one Mitsuba is already set to, else ``cuda_ad_rgb`` or
             ``llvm_ad_rgb`` where they work, else ``scalar_rgb``.
         film: filter and lens of jittered samples, as in Mitsuba's own renderer: noisy colours and references then have
-            noisy features of the same samples, for every noise seed its own. With several threads the sums differ by
-            rounding from run to run. By default all samples are at the pixel centre.
+            noisy features of the same samples, for every noise seed its own. By default all samples are at the pixel
+            centre.
         keep_samples: also write the single paths of each noisy colour, as layers of ``samplesN.exr``; on a film with
             the features of each path.
         engine: renders the frames instead of processes of this machine, such as a
@@ -96,7 +97,6 @@ def render_sequence(
         InputError: Mitsuba is missing, the scene cannot be loaded, a setting is invalid, a moving object does not
             exist, a frame failed, or ``out`` cannot be written or holds a sequence with other settings.
     """
-    width, height = size
     cameras = list(cameras)
     checked_moves = check_moves(moves or {}, len(cameras))
     count = len(cameras) if frames is None else min(frames, len(cameras))
@@ -120,11 +120,12 @@ def render_sequence(
             raise InputError(
                 f"scene dictionary: expected plain Python and numpy for more than one worker, found {error}"
             ) from error
-    tracer = Tracer(scene, variant, max_depth, checked_moves)
-    reach = tracer.reach(cameras)
+    stage = Stage(scene, variant, checked_moves)
+    reach = stage.reach(cameras)
+    tracer = SequenceTracer(stage, cameras, size, film, max_depth, reach)
     tracer.place(0)
-    distance = tracer.features(pixel_rays(cameras[0], width, height)).distance
-    scale = float(np.median(np.minimum(distance, reach)))
+    away = tracer.features(0)["position"] - cameras[0].to_world[:3, 3]
+    scale = float(np.median(np.linalg.norm(away, axis=1)))
     near, far = 0.01 * scale, 2 * reach
     cameras = cameras[:count]
     settings = describe(
@@ -133,7 +134,7 @@ def render_sequence(
         size,
         (near, far),
         checked_moves,
-        renderer=tracer.name,
+        renderer=stage.name,
         noisy_spp=spp,
         film=None if film is None else asdict(film),
         # Omitted if unused, as in folders of versions without this setting.
@@ -177,40 +178,22 @@ def render_sequence(
 
     advance(job.paths_there())
     missing = [number for number in range(count) if not job.is_finished(number)]
-    if engine is not None:
-        paths_per_frame = (total - done) // max(len(missing), 1)
-
-        def finish(number: int, state: ReferenceState | None) -> None:
-            advance(paths_per_frame)
-            if state is not None:
-                folder.note_reference(number, state)
-
-        _render_on_engine(job, missing, engine, finish)
-    else:
+    if engine is None:
         for number in missing:
-            state = render_frame(job, tracer, number, advance)
-            if state is not None:
-                folder.note_reference(number, state)
-    return folder.path
+            folder.note_reference(number, render_frame(job, tracer, number, advance))
+        return folder.path
+    paths_per_frame = (total - done) // max(len(missing), 1)
 
+    def finish(call: tuple[FrameJob, int], state: ReferenceState | None) -> None:
+        advance(paths_per_frame)
+        folder.note_reference(call[1], state)
 
-def _render_on_engine(
-    job: FrameJob, numbers: Sequence[int], engine: Engine, on_frame: Callable[[int, ReferenceState | None], None]
-) -> None:
-    """Render frames, each a task of an engine; the error names the first that failed, when all others are finished."""
-    failed: list[str] = []
-
-    def one(number: int) -> Job:
-        [(state, reason)] = yield [Task(render_frame_task, (job, number))]
-        if reason is None:
-            on_frame(number, state)
-        else:
-            failed.append(f"frame {number}: {reason}")
-
-    run_jobs(engine, map(one, numbers))
+    failed = run_tasks(engine, render_frame_task, [(job, number) for number in missing], finish)
     if failed:
+        (_, number), reason = failed[0]
         others = f"; {len(failed) - 1} more frames failed" if len(failed) > 1 else ""
-        raise InputError(f"{failed[0]}{others}; finished frames are kept")
+        raise InputError(f"frame {number}: {reason}{others}; finished frames are kept")
+    return folder.path
 
 
 def _check_settings(size: tuple[int, int], count: int, references: frozenset[int], noise_level: float | None) -> None:

@@ -1,0 +1,106 @@
+"""Color of the frames of a sequence, and features with positions, at pixel centres or on a film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.scenes.render.film import Film
+from mcdenoise.scenes.render.stage import Stage
+from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, NORMAL, REST, WAVEFRONT, Samples, Tracer
+
+RR_DEPTH, STRATIFIED_PATHS = 5, 16
+_SCALAR_PASS = 8
+_LAYERS = 8
+
+
+class SequenceTracer(Tracer):
+    """The scene of a sequence.
+
+    Args:
+        stage: the scene.
+        cameras: one a frame.
+        size: width and height in pixels.
+        film: filter and lens; without one all samples are at the pixel centre.
+        max_depth: longest path, in segments.
+        reach: distance of the background in scene units.
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        cameras: Sequence[Camera],
+        size: tuple[int, int],
+        film: Film | None,
+        max_depth: int,
+        reach: float,
+    ) -> None:
+        mi = stage.mitsuba
+        bsdfs = [shape.bsdf() for shape in stage.scene.shapes()]
+        # An instance has none of its own.
+        clear = any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+        layers = _LAYERS if clear else 0
+        super().__init__(stage, cameras, size, film or Film("centre"), (max_depth, RR_DEPTH), layers=layers)
+        self._exact, self._reach = film is None, reach
+        self.paths_per_pass = _SCALAR_PASS if stage.scalar else max(1, WAVEFRONT // (size[0] * size[1]))
+
+    def radiance(self, frame: int, paths: int, seed: Sequence[int], stratified: bool = False) -> Array:
+        """Mean radiance ``(H*W, 3)`` of paths a pixel; a filter with negative lobes gives negative values."""
+        # Other filters are in the places of the samples, which is as good and faster.
+        even = not self._exact and self.film.filter == "mitchell"
+        kind = {"exact": self._exact, "stratified": stratified, "even": even}
+        return self.pixels(self.trace(frame, paths, seed, features=False, **kind))
+
+    def frame(self, frame: int, paths: int, seed: Sequence[int]) -> dict[str, Array]:
+        """Color and features of the same independent samples, by buffer names, ``(H*W, C)``."""
+        return self._buffers(frame, self.trace(frame, paths, seed, exact=self._exact, even=self.film.spreads))
+
+    def features(self, frame: int) -> dict[str, Array]:
+        """Features at the pixel centres, by buffer names, ``(H*W, C)``."""
+        return self._buffers(frame, self.trace(frame, 1, (0,), color=False, exact=True))
+
+    def _buffers(self, frame: int, samples: Samples) -> dict[str, Array]:
+        """Buffers; the background is at a distance behind everything, and has neither normal nor albedo."""
+        pixels = self.pixels(samples)
+        position, eye = pixels[:, REST : REST + 3], self._cameras[frame].to_world
+        # A filter with negative lobes may exceed the range of its input; a few BSDFs' albedo exceeds 1.
+        length = np.linalg.norm(pixels[:, NORMAL], axis=1, keepdims=True)
+        found = {
+            "color": np.maximum(pixels[:, COLOR], 0),
+            "albedo": np.clip(pixels[:, ALBEDO], 0, 1),
+            "normal": pixels[:, NORMAL] / np.maximum(length, 1),
+            "position": position,
+            "depth": np.maximum((position - eye[:3, 3]) @ eye[:3, 2], 0),
+        }
+        return found | ({"previous_position": pixels[:, REST + 3 :]} if self._stage.moves else {})
+
+    def _glossy(self, hit: Any, bsdf: Any, diffuse: Any) -> Any:
+        """Directional albedo of rough metals towards the viewer, by a fixed 4x4 grid of samples, so without noise."""
+        mi, dr = self._mi, self._dr
+        # Use select instead of ~diffuse, which is not a logical negation for a Python bool.
+        rough = dr.select(diffuse, False, mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection)) & hit.is_valid()
+        if self._scalar and not rough:
+            return mi.Color3f(0)
+        # Evaluate the inputs first; otherwise each sample would trace the rays again.
+        dr.eval(hit, rough)
+        total = mi.Color3f(0)
+        grid = [(i + 0.5) / 4 for i in range(4)] if dr.any(rough) else []
+        for x in grid:
+            for y in grid:
+                # Evaluate one sample at a time with opaque inputs: one small kernel, used 16 times.
+                point = mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y))
+                total += bsdf.sample(mi.BSDFContext(), hit, 0.5, point, rough)[1]
+                dr.eval(total)
+        return total / 16
+
+    def _rest(self, ray: Any, hit: Any, valid: Any, shot: Any) -> list[Any]:
+        """Position, and where the point was in the previous frame if anything moves."""
+        mi, dr = self._mi, self._dr
+        far = ray.o + (self._reach if self._scalar else dr.opaque(mi.Float, self._reach)) * ray.d
+        if self._scalar and not valid:
+            return [*far, *(far if self._stage.moves else [])]
+        positions = [hit.p, self._earlier(hit, shot)] if self._stage.moves else [hit.p]
+        return [channel for position in positions for channel in dr.select(valid, position, far)]
