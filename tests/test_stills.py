@@ -113,6 +113,15 @@ def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]],
     assert "2 frames" in refuses("evaluate", tmp_path / "a", tmp_path / "b" / "b1.exr")
 
 
+def test_files_with_layers_are_references(tmp_path: Path) -> None:
+    rendered = Path(__file__).parent / "data" / "renderers" / "blender"
+    succeeds("denoise", rendered, "-o", tmp_path / "out", "--model", "noisy")
+    for where in (rendered, tmp_path / "out"), (rendered / "shot_0001.exr", tmp_path / "out" / "shot_0001.exr"):
+        succeeds("evaluate", *where, "--json", tmp_path / "errors.json")
+        mean = json.loads((tmp_path / "errors.json").read_text())["protocols"]["strict"]["mean"]
+        assert mean["SMAPE"] == pytest.approx(0, abs=1e-3)
+
+
 def test_pictures_without_features_are_stills_and_no_broken_shot(
     buffers: dict[str, NDArray[Any]], tmp_path: Path
 ) -> None:

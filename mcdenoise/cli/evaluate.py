@@ -12,6 +12,7 @@ import tyro
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
 from mcdenoise.data import open_sequence
+from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import Evaluation, evaluate_folder, evaluate_halves, evaluate_method
 from mcdenoise.methods import parse_method
@@ -63,7 +64,10 @@ def evaluate(
         raise InputError(f"expected one folder of images, found {named}; several are compared by --half")
     opened = open_sequence(sequence, frames)
     if images and not opened.reference_numbers:
-        opened = open_sequence({"color": sequence, "reference": sequence}, frames)
+        if isinstance(opened, RenderedFiles):
+            opened = open_sequence(sequence, frames, mapping=[f"reference={opened.choice.written[0]}"])
+        else:
+            opened = open_sequence({"color": sequence, "reference": sequence}, frames)
         say(f"{sequence} has no references, and is taken as the reference")
     spelling = None if model is None else parse_method(model)
     total = len(opened.reference_numbers if spelling is None else opened.numbers)
