@@ -113,6 +113,15 @@ def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]],
     assert "2 frames" in refuses("evaluate", tmp_path / "a", tmp_path / "b" / "b1.exr")
 
 
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_display_values_are_compared_as_light(ending: str, buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        write_radiance(tmp_path / f"{name}{ending}", buffers["y"])
+    file = tmp_path / "errors.json"
+    succeeds("evaluate", tmp_path / f"one{ending}", tmp_path / f"other{ending}", "--json", file)
+    assert json.loads(file.read_text())["protocols"]["strict"]["mean"]["SMAPE"] == pytest.approx(0, abs=1e-6)
+
+
 def test_files_with_layers_are_references(tmp_path: Path) -> None:
     rendered = Path(__file__).parent / "data" / "renderers" / "blender"
     succeeds("denoise", rendered, "-o", tmp_path / "out", "--model", "noisy")

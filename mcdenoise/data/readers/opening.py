@@ -114,17 +114,17 @@ class Result:
     Args:
         path: the file.
         layer: layer of the radiance.
-        window: its data window.
+        part: the part of the file that has it.
     """
 
     path: Path
     layer: Layer
-    window: Window
+    part: Part
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
-        return self.window.size
+        return self.part.window.size
 
     def read(self, window: Window | None = None) -> tuple[Tensor, Metadata]:
         """Read ``(1, 3, H, W)`` radiance, thrice the same from one channel, and the attributes of the file.
@@ -137,7 +137,8 @@ class Result:
         """
         pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
         pixels = np.repeat(pixels, 3, -1) if pixels.shape[2] == 1 else pixels
-        pixels = pixels if window is None else window.of(pixels, self.window)
+        pixels = decode(pixels, self.part.gamma) if self.part.display_referred else pixels
+        pixels = pixels if window is None else window.of(pixels, self.part.window)
         image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
         return image, read_image_header(self.path).metadata
 
@@ -151,7 +152,7 @@ def open_result(path: Path) -> Result:
     parts = read_image_header(path).parts
     chosen = choose(str(path), layers_of(0, "", parts), {}, functools.partial(read_layers, path))
     (layer, *_) = chosen.written
-    return Result(path, layer, parts[layer.part].window)
+    return Result(path, layer, parts[layer.part])
 
 
 def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers) -> set[Layer]:
