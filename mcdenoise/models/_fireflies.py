@@ -106,15 +106,17 @@ def light_of_fireflies(color: Tensor) -> Tensor:
     # A graph for images of any size has no strips.
     whole = step == _BLOCK or torch.compiler.is_compiling()
     strips = [color] if whole else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
+    # Together, as images of a batch; the last one may be lower.
+    full = [strip for strip in strips if strip.shape[-2] == strips[0].shape[-2]]
     fractions = []
-    for strip in strips:
+    for strip in (torch.cat(full) if full[1:] else full[0], *strips[len(full) :]):
         light = strip.to(torch.promote_types(color.dtype, torch.float32))
         before, after = (
             F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
             for image in (light, incoming(light, compared=False))
         )
         # Not a number where there is no light to lose.
-        fractions.append((1 - after / before).flatten(1))
+        fractions.append((1 - after / before).unflatten(0, (-1, len(color))).transpose(0, 1).flatten(1))
     lost = torch.cat(fractions, 1)
     # The lower median of all numbers, like nanmedian, which ONNX lacks.
     known = (~lost.isnan()).sum(1, keepdim=True)
