@@ -116,7 +116,7 @@ def light_of_fireflies(color: Tensor) -> Tensor:
             for image in (light, incoming(light, compared=False))
         )
         # Not a number where there is no light to lose.
-        fractions.append((1 - after / before).unflatten(0, (-1, len(color))).transpose(0, 1).flatten(1))
+        fractions.append((1 - after / before).unflatten(0, (-1, color.shape[0])).transpose(0, 1).flatten(1))
     lost = torch.cat(fractions, 1)
     # The lower median of all numbers, like nanmedian, which ONNX lacks.
     known = (~lost.isnan()).sum(1, keepdim=True)
