@@ -301,7 +301,7 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
     message = refused(lambda: Denoiser("oidn_tuned", fractoin=torch.zeros(9, 9)))
     assert message == (
         "argument 'fractoin': expected an argument of Denoiser or a setting of model 'oidn_tuned' (size, fraction, "
-        "clamp, restore), found none of this name; did you mean fraction?"
+        "restore), found none of this name; did you mean fraction?"
     )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"

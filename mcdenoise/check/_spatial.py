@@ -56,6 +56,7 @@ def _filter(function: Any) -> Op:
     return checked(
         function,
         _filtered,
+        ordinary("5x5 taps, RGB", (1, 3, 2, 3), border="replicate", kernel_size=5),
         ordinary("weights of both signs", (1, 3, 2, 3), kernel=between(-1, 1), border="zeros"),
         stiff("peaked weights", (1, 3, 2, 3), radiance, kernel=softmax(15), border="replicate"),
         stiff("sum of the weights of 1e-3", smooth=("image",), kernel=softmax(3, 1e-3), border="renormalize"),

@@ -636,7 +636,7 @@ def test_a_header_that_means_nothing_is_refused(weights: Path, key: str, value: 
 
 
 def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
-    beside = "model 'oidn_tuned': expected no settings but fraction, clamp, restore beside its weights, found "
+    beside = "model 'oidn_tuned': expected no settings but fraction, restore beside its weights, found "
     for settings, found in (({"quality": "high"}, "quality=high"), ({"size": "small"}, "size=small")):
         message = refused(lambda settings=settings: create_model("oidn_tuned", pretrained=True, **settings))
         assert message == (
