@@ -3,8 +3,8 @@
     mcdenoise generate --takes --unseen --seeds 900000-900015 -o unseen
     python examples/takes.py unseen --clean clean --models oidn_temporal oidn_tuned
 
-A reference of a take has 264 samples a pixel; its noise is a quarter to two thirds of the error of a good method, which
-hides what methods differ by. So ``clean`` gets copies with clean references first
+A reference of a take has 264 samples a pixel; its noise is up to two thirds of the error of a good method, which hides
+what methods differ by; without ``clean``, errors contain it. So ``clean`` gets copies with clean references first
 (:func:`mcdenoise.train.clean_references`). Errors are of the frames with references, the last three of a shot of 16.
 Open Image Denoise has its better setting of each take: features as noisy, or denoised first.
 """
@@ -13,38 +13,31 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from mcdenoise.data.files import write_json
-from mcdenoise.data.shards import Shard, find_shards, open_shard
+from mcdenoise.data.shards import find_shards, open_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
-from mcdenoise.models import Model, create_model
+from mcdenoise.models import Model
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
+from mcdenoise.train.packed import frame_of
 
 OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=prefiltered)")
 
 
-def made(text: str) -> Model:
-    """The method that a text names, with its shipped weights."""
-    method = parse_method(text)
-    return create_model(method.model, pretrained=method.weights is None, weights=method.weights, **method.settings)
-
-
 @torch.no_grad()
-def errors(model: Model, shard: Shard) -> dict[str, float]:
-    """Errors of a method on the frames that have references."""
-    arrays = {name: torch.from_numpy(array).float() for name, array in shard.read().items()}
-    reference = arrays.pop("reference")
+def errors(model: Model, frames: Sequence[Frame], reference: Tensor) -> dict[str, float]:
+    """Errors of a method on the last frames, which have references."""
     state, images = None, []
-    for t in range(len(shard)):
-        frame, _ = Frame(**{name: array[t : t + 1] for name, array in arrays.items()}).validate()
+    for frame in frames:
         output, state = model(frame, state)
         images.append(output.image)
     scale = oidn_exposure(reference[-1:])
@@ -92,12 +85,16 @@ def main() -> None:
 
     torch.set_num_threads(options.threads)
     models = [*OIDN, *options.models]
-    denoisers = {name: made(name) for name in models}
+    denoisers = {name: parse_method(name).denoiser(precision="float32").model for name in models}
     rows = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
     for path in (path for folder in options.takes for path in find_shards(folder)):
         shard = open_shard(clean_references(path, options.clean) if options.clean else path)
         row = rows.setdefault(path.name.partition(".")[0], {})
-        row |= {name: errors(model, shard) for name, model in denoisers.items() if name not in row}
+        if missing := denoisers.keys() - row.keys():
+            arrays = shard.read()
+            frames = [frame_of(arrays, t) for t in range(len(shard))]
+            reference = torch.from_numpy(arrays["reference"]).float()
+            row |= {name: errors(denoisers[name], frames, reference) for name in sorted(missing)}
         if options.json:
             write_json(options.json, rows)
         print(path.name, {name: row[name]["smape"] for name in models}, flush=True)

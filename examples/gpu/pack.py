@@ -15,14 +15,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.shards import Shard
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
 from mcdenoise.train.front import Front, split
-from mcdenoise.train.packed import _read, open_packed
+from mcdenoise.train.packed import describe_packed, open_packed, shots_of
 
+FEATURES = frozenset({"albedo", "normal"})
 FIXED = ("current", "albedo", "normal", "reference")
 HISTORY = ("color", "length")
 # The last bits of a half float that are dropped.
@@ -44,14 +46,6 @@ def planes(name: str, arrays: list[NDArray[np.float16]]) -> dict[str, NDArray[np
     return {f"{name}.{byte}": np.ascontiguousarray(both[..., byte]) for byte in (0, 1)}
 
 
-def seen(shard: Shard, front: Front) -> Iterator[dict[str, NDArray[np.float16]]]:
-    """The frames with references of a take, with each history."""
-    first, features = len(shard) - shard.references, frozenset({"albedo", "normal"})
-    front = front.of(frozenset(shard.shapes))
-    for start in (0, 1 + int(shard.digest, 16) % first) if first else (0,):
-        yield _read(shard, front, features, start, first)
-
-
 def tiles(size: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
     """The places of the tiles of an image; what is left over at its end is dropped."""
     for top in range(0, size[0] - TILE[0] + 1, TILE[0]):
@@ -59,25 +53,26 @@ def tiles(size: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
             yield slice(top, top + TILE[0]), slice(left, left + TILE[1])
 
 
+def part_of(shot: dict[str, Tensor], names: tuple[str, ...], place: tuple[slice, slice]) -> NDArray[np.float16]:
+    """A tile of these buffers, together ``(T, C, H, W)``."""
+    return np.concatenate([shot[name][:, :, *place].numpy() for name in names], 1, dtype=np.float16)
+
+
 def written(shards: list[Shard], front: Front, path: Path) -> None:
     """Write a part."""
     fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
     for shard in shards:
-        found = list(seen(shard, front))
-        about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(found)}
-        for rows, columns in tiles(shard.size):
+        handed = front.of(shard.shapes), FEATURES, shard.references
+        shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)]
+        about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(shots)}
+        for place in tiles(shard.size):
             index.append(about)
-            fixed.append(np.concatenate([found[0][name][..., rows, columns] for name in FIXED], 1, dtype=np.float16))
-            history += [np.concatenate([e[name][..., rows, columns] for name in HISTORY], 1) for e in found]
-    text = np.frombuffer(json.dumps({"index": index, "credits": credits_of(shards)}).encode(), np.uint8)
+            fixed.append(part_of(shots[0], FIXED, place))
+            history += [part_of(shot, HISTORY, place) for shot in shots]
+    text = np.frombuffer(json.dumps({"index": index, **describe_packed(shards)}).encode(), np.uint8)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=text, **planes("fixed", fixed), **planes("history", history))
     print(f"{path}: {len(shards)} takes, {path.stat().st_size / 1e6:.1f} MB", flush=True)
-
-
-def credits_of(shards: list[Shard]) -> list[str]:
-    """Whom the assets of the takes are owed to."""
-    return sorted({str(line) for shard in shards for line in shard.header.get("credits", [])})
 
 
 def main() -> None:

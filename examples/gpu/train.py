@@ -32,16 +32,17 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
-from mcdenoise.models import create_model, save_weights, start_with
+from mcdenoise.models import save_weights
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.front import split
+from mcdenoise.train.loop import begun
 from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
+from mcdenoise.train.run_folder import about_weights
 
 FRAMES = 2
 LOOK = 20.0  # seconds between validations, and looks for new parts
@@ -66,32 +67,34 @@ class Tiles:
     fixed: Tensor = field(init=False)
     history: Tensor = field(init=False)
     takes: list[dict[str, Any]] = field(default_factory=list)
-    credits: set[str] = field(default_factory=set)
-    read: set[str] = field(default_factory=set)
+    parts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.fixed = torch.empty(0, sum(CHANNELS.values()), *TILE, dtype=torch.float16, device=self.device)
         self.history = torch.empty(0, 4, *TILE, dtype=torch.float16, device=self.device)
         self.update()
+        if not self.takes:
+            raise InputError(f"{self.folder}: expected parts that pack.py has written, found none")
 
-    def update(self) -> bool:
-        """Read the parts that have come; whether there are any."""
-        new = sorted(path for path in self.folder.glob("*.npz") if path.name not in self.read)
-        for path in new:
+    @property
+    def about(self) -> list[dict[str, Any]]:
+        """What identifies the takes of each part, and whom they are owed to."""
+        return [{"part": name, **about} for name, about in self.parts.items()]
+
+    def update(self) -> None:
+        """Read the parts that have come."""
+        for path in sorted(path for path in self.folder.glob("*.npz") if path.name not in self.parts):
             with np.load(path, allow_pickle=False) as part:
                 about = json.loads(part["about"].tobytes())
                 fixed, history = (self._joined(part, name) for name in ("fixed", "history"))
             first, begun = len(self.fixed), len(self.history)
-            for take in about["index"]:
+            for take in about.pop("index"):
                 self.takes.append({**take, "first": first, "begun": begun})
                 first, begun = first + take["frames"], begun + take["frames"] * take["histories"]
             self.fixed, self.history = torch.cat([self.fixed, fixed]), torch.cat([self.history, history])
-            self.credits.update(about["credits"])
-            self.read.add(path.name)
-        if new:
-            rows = [[take[name] for name in ("first", "begun", "frames", "histories")] for take in self.takes]
-            self.table = torch.tensor(rows, device=self.device)
-        return bool(new)
+            self.parts[path.name] = about
+        rows = [[take[name] for name in ("first", "begun", "frames", "histories")] for take in self.takes]
+        self.table = torch.tensor(rows, device=self.device)
 
     def _joined(self, part: Any, name: str) -> Tensor:
         low, high = (torch.from_numpy(part[f"{name}.{byte}"]).to(self.device) for byte in (0, 1))
@@ -179,7 +182,7 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
 def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Where lamps are, their radiance and albedo."""
     clips, side = len(reference) // FRAMES, torch.arange(config.crop, device=reference.device)
-    own = torch.rand(8, clips, device=reference.device)
+    own = torch.rand(7, clips, device=reference.device)
     sizes = 2 + own[:2] * (config.crop // 3)
     starts = own[2:4] * (config.crop - sizes)
     rows, columns = ((side >= s[:, None]) & (side < (s + n)[:, None]) for s, n in zip(starts, sizes, strict=True))
@@ -238,10 +241,7 @@ class Run:
         config = self.config
         torch.manual_seed(config.seed)
         random.seed(config.seed)
-        self.network: Any = create_model(config.model, **config.model_settings).train()
-        if config.start_from:
-            method = parse_method(config.start_from)
-            start_with(self.network, method.model, **method.settings)
+        self.network, self.settings, self.start = begun(config)
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
@@ -273,10 +273,12 @@ class Run:
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - kept)
         return loss.detach()
 
-    def save(self, path: Path, about: dict[str, str]) -> None:
+    def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write the averaged weights."""
+        commits = [{"first_step": 0, "commit": source_commit()}]
+        about = about_weights(asdict(self.config), identity | {"initial_weights": self.start}, self.steps, commits)
         with atomic_path(path) as temporary:
-            temporary.write_bytes(save_weights(self.average, self.config.model, self.config.model_settings, about))
+            temporary.write_bytes(save_weights(self.average, self.config.model, self.settings, about))
 
 
 def main() -> None:
@@ -291,7 +293,7 @@ def main() -> None:
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     options = parser.parse_args()
 
-    begun, device = time.monotonic(), torch.device(options.device)
+    start, device = time.monotonic(), torch.device(options.device)
     torch.backends.cudnn.benchmark = True
     recipe = Recipe.read(options.recipe, options_of("generate"))
     (chosen,) = recipe.chosen([options.run] if options.run else [recipe.runs[0].name])
@@ -302,7 +304,7 @@ def main() -> None:
     weights, log = options.out / f"{config.model}.safetensors", list[str]()
     next_look, losses = 0.0, list[Tensor]()
     while True:
-        passed = time.monotonic() - begun
+        passed = time.monotonic() - start
         over = passed >= options.seconds
         if over or passed >= next_look:
             tiles.update()
@@ -312,23 +314,13 @@ def main() -> None:
             log.append(json.dumps(row))
             write_text(options.out / "log.jsonl", "\n".join(log) + "\n")
             print({name: value for name, value in row.items() if name != "takes"}, flush=True)
-            about = {"config": json.dumps(asdict(config)), "steps": str(run.steps), "commit": source_commit()}
-            about |= {"credits": recipe.credits, "recipe": chosen.sha256}
-            about["data"] = json.dumps(
-                {"takes": len({take["take"] for take in tiles.takes}), "credits": authors(tiles)}
-            )
-            run.save(weights, about)
+            run.save(weights, {"sequences": tiles.about, "credits": recipe.credits, "recipe": chosen.sha256})
             losses.clear()
-            next_look = time.monotonic() - begun + LOOK
+            next_look = time.monotonic() - start + LOOK
         if over:
             break
         losses.append(run.step(tiles, options.clips, passed / options.seconds))
     print(weights)
-
-
-def authors(tiles: Tiles) -> list[str]:
-    """Authors and licences of the assets, from lines with a name and these in parentheses."""
-    return sorted({line.partition(" (")[2].rstrip(")") for line in tiles.credits})
 
 
 if __name__ == "__main__":

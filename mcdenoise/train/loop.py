@@ -119,7 +119,7 @@ def train(
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
     torch.manual_seed(config.seed)
-    network, settings, start = _begun(config, initial_weights)
+    network, settings, start = begun(config, initial_weights)
     front, rest = split(network)
     folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
 
@@ -156,7 +156,7 @@ def train(
     return weights
 
 
-def _begun(config: TrainConfig, weights: Path | None) -> tuple[Any, dict[str, Any], str]:
+def begun(config: TrainConfig, weights: Path | None = None) -> tuple[Any, dict[str, Any], str]:
     """The model in training mode, its settings, and the checksum of the weights that it begins with."""
     start: dict[str, Any] = describe_weights(weights) if weights else {"settings": {}, "sha256": "none"}
     settings: dict[str, Any] = {**start["settings"], **config.model_settings}

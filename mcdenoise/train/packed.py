@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -75,16 +75,21 @@ def _read(shard: Shard, front: Front, buffers: frozenset[str], start: int, first
         return found
     step, processed = front.begin(), {name: list[Array]() for name in front.parts}
     for t in range(start, len(shard)):
-        images: dict[str, Any] = {
-            name: torch.from_numpy(array[t : t + 1].astype(np.float32))
-            for name, array in arrays.items()
-            if name not in ("reference", ERROR)
-        }
-        seen = dict(step(Frame(**images).validate()[0]).items())
+        seen = dict(step(frame_of(arrays, t)).items())
         if t >= first:
             for name, own in processed.items():
                 own.append(seen[name].clamp(max=_LARGEST).half().numpy())
     return found | {name: np.concatenate(own) for name, own in processed.items()}
+
+
+def frame_of(arrays: Mapping[str, Array], t: int) -> Frame:
+    """Frame ``t`` of the arrays of a take, without its reference."""
+    images: dict[str, Any] = {
+        name: torch.from_numpy(array[t : t + 1].astype(np.float32))
+        for name, array in arrays.items()
+        if name not in ("reference", ERROR)
+    }
+    return Frame(**images).validate()[0]
 
 
 def describe_packed(shards: list[Shard]) -> dict[str, Any]:
