@@ -216,10 +216,10 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
         with (order.records / f"{order.run}{secrets.token_hex(8)}.jsonl").open("ab", buffering=0) as journal:
             # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
             for part in cut(piece.numbers, left, 0, opened.found.overlap):
-                numbers = list(part.numbers)
+                numbers, keys = list(part.numbers), Keys(opened)
                 while left & set(numbers):
                     try:
-                        _write(order, opened, numbers, left, journal)
+                        _write(order, keys, numbers, left, journal)
                     except FrameError as error:
                         numbers = [number for number in numbers if number > error.number]
                         failed |= {number: str(error) for number in left & {error.number}}
@@ -229,9 +229,10 @@ def make(order: Order, piece: Piece) -> dict[int, str]:
     return failed
 
 
-def _write(order: Order, opened: Opened, numbers: list[int], left: set[int], journal: BinaryIO) -> None:
+def _write(order: Order, keys: Keys, numbers: list[int], left: set[int], journal: BinaryIO) -> None:
     """Denoise frames, write those that are left, and record each as it is finished, which takes it from them."""
-    settings, keys = opened.found.shot.settings, Keys(opened)
+    opened = keys.opened
+    settings = opened.found.shot.settings
     report = new_report(opened.sequence, "")
     shown: Tensor | None = None
 

@@ -14,7 +14,7 @@ from mcdenoise.ops._steps.history import incoming
 # Of a pixel that is clamped in several frames in a row, the first one is believed to be as bright as its neighbours,
 # and each later one this many times as bright as the one before. So a star a thousand times as bright as its sky has
 # its light from the fifth frame on, while two fireflies in one place remain fireflies, also where the limit is 15.
-GAIN = 6.0
+_GAIN = 6.0
 # Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
 _BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
 
@@ -41,14 +41,14 @@ def believed(full: Tensor, least: Tensor, limit: Tensor, before: Tensor | None, 
         if not len(rows):
             return neighbours
         place = (batch, torch.zeros_like(batch), rows, columns)
-        bound = GAIN * _moved(before, motion, batch, rows, columns)
+        bound = _GAIN * _moved(before, motion, batch, rows, columns)
         return neighbours.index_put(place, torch.maximum(neighbours[place], torch.minimum(full[place], bound)))
     (count, _, height, width), device = full.shape, full.device
     batch = torch.arange(count, device=device)[:, None, None]
     bound = _moved(
         before, motion, batch, torch.arange(height, device=device)[:, None], torch.arange(width, device=device)
     )
-    bound = GAIN * bound[:, None]
+    bound = _GAIN * bound[:, None]
     return torch.where(bright, torch.maximum(neighbours, torch.minimum(full, bound)), neighbours)
 
 

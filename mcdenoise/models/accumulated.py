@@ -41,7 +41,7 @@ CUT_FRACTION = 0.05
 SPECULAR_LENGTH = 2.0
 # Where clamping would take more than this fraction of the light of the median block, the shot's light is caustics,
 # which have another limit.
-_LOST, CAUSTICS = 0.1, 120.0
+_LOST, _CAUSTICS = 0.1, 120.0
 # A light is steady if its compressed radiance varied by less than this fraction over the history.
 _STEADY = 0.1
 _NO_WAY = "no motion, and no position with a previous camera"
@@ -412,7 +412,7 @@ class Accumulated(Wrapper):
         """The limit of the fireflies of each image of a shot that begins with this frame."""
         if self.firefly_limit is not None:
             return torch.full_like(color[:, :1, :1, :1], self.firefly_limit, dtype=torch.float32)
-        return torch.where(light_of_fireflies(color) > _LOST, CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
+        return torch.where(light_of_fireflies(color) > _LOST, _CAUSTICS, LIMIT).reshape(-1, 1, 1, 1).to(torch.float32)
 
     def _notes(self, frame: Frame, *, still: bool, keeps: bool) -> list[Note]:
         can_move = tells_motion(frame.buffers)

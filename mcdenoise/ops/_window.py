@@ -96,11 +96,12 @@ def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> 
                 image.index_select(dim, mirrored_places(torch.arange(*place, device=image.device), size))
                 for place in ((-before, 0), (size, size + after))
             ]
-            image = torch.cat([ends[0], image, ends[1]], dim)
         elif before or after:
             # A fifth of the calls, each of which is a kernel on a GPU.
             ends = [image.narrow(dim, start, count).flip(dim) for start, count in ((0, before), (size - after, after))]
-            image = torch.cat([ends[0], image, ends[1]], dim)
+        else:
+            continue
+        image = torch.cat([ends[0], image, ends[1]], dim)
     return image
 
 
