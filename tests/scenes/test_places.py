@@ -16,7 +16,8 @@ import pytest
 
 from mcdenoise.data.camera_path import Camera, check_moves
 from mcdenoise.scenes.assets import Assets
-from mcdenoise.scenes.random.builder import bounds
+from mcdenoise.scenes.random.builder import SceneBuilder, bounds
+from mcdenoise.scenes.random.cameras import shoot
 from mcdenoise.scenes.render.features import SequenceTracer
 from mcdenoise.scenes.render.loading import scene_digest
 from mcdenoise.scenes.render.stage import Stage
@@ -169,3 +170,9 @@ def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
         radiance = tracer.radiance(FRAMES - 1, 4, (seed, 0))
         assert np.isfinite(radiance).all(), seed
         assert radiance.mean() > 0, seed
+
+
+def test_a_place_without_things_has_a_camera_path() -> None:
+    cameras = shoot(SceneBuilder((-5, 0, -5), (5, 3, 5)), np.random.default_rng(0), 3)
+
+    assert len(cameras) == 3 and np.isfinite([camera.to_world for camera in cameras]).all()

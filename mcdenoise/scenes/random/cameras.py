@@ -72,7 +72,7 @@ def _score(boxes: tuple[Array, Array], view: _View) -> float:
     lows, highs = boxes
     forward = view.target - view.origin
     distance = float(np.linalg.norm(forward))
-    if distance < 0.5 or abs(forward[1]) > 0.9 * distance:
+    if not len(lows) or distance < 0.5 or abs(forward[1]) > 0.9 * distance:
         return 0.0
     forward /= distance
     left = np.cross((0.0, 1.0, 0.0), forward)
