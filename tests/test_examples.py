@@ -389,3 +389,6 @@ def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path
     assert first["step"] == 0 < last["step"]
     assert set(last["takes"]) == {"0", "1"}
     assert "Ann, CC0" in describe_weights(Path(weights))["data"]
+    # The same command again has no seconds left, and makes no step.
+    run("gpu/train.py", packed, "-o", tmp_path / "out", *options)
+    assert json.loads((tmp_path / "out" / "log.jsonl").read_text().splitlines()[-1])["step"] == last["step"]

@@ -1,14 +1,14 @@
-"""Train a run of a recipe on a GPU that holds all takes in its memory, for a given number of seconds.
+"""Train a run of a recipe on a device that holds all takes in its memory, for a given number of seconds.
 
     python examples/gpu/pack.py TAKES... -o packed
     python examples/gpu/pack.py UNSEEN... -o packed-unseen
     python examples/gpu/train.py packed -o OUT --recipe recipes/wild.toml --run base --validation packed-unseen
 
-Parts may be added to the folder while it runs. Clips are drawn and augmented on the GPU, many at once, as
+Parts may be added to the folder while it runs. Clips are drawn and augmented on the device, many at once, as
 :class:`mcdenoise.train.ClipSampler` draws them one by one; the learning rate follows the clock. The loss of a clip is
 the logarithm of its errors, so that a clip with little noise counts as much as one with much: what is reported of a
-method is the geometric mean of ratios. OUT has the averaged weights, which are written again at each validation, and
-the log.
+method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are written again
+at each validation. The same command goes on where an interrupted run was.
 """
 
 import argparse
@@ -45,7 +45,7 @@ from mcdenoise.train.recipe import Recipe
 from mcdenoise.train.run_folder import about_weights
 
 FRAMES = 2
-LOOK = 20.0  # seconds between validations, and looks for new parts
+LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least that many seconds apart
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a clip before its logarithm is taken
 BARE = 0.06  # probability that a clip has no normal, and half that of one without albedo
@@ -246,7 +246,7 @@ class Run:
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.rest, self.averaged = split(self.network)[1], split(self.average)[1]
-        self.steps = 0
+        self.steps, self.passed = 0, 0.0
 
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
         """Make a step at a part of the time."""
@@ -255,7 +255,8 @@ class Run:
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * rate
         frame, reference, moving = tiles.draw(config, clips)
-        with torch.autocast(self.device.type, torch.bfloat16):
+        # Most CPUs emulate half precision.
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             image = self.rest(frame)[0].image
         loss = errors(image.float(), reference, moving, config).mean()
         self.optimizer.zero_grad()
@@ -273,6 +274,21 @@ class Run:
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - kept)
         return loss.detach()
 
+    def keep(self, path: Path) -> None:
+        """Write a checkpoint."""
+        parts = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer")}
+        with atomic_path(path) as temporary:
+            torch.save({**parts, "steps": self.steps, "passed": self.passed}, temporary)
+
+    def resume(self, path: Path) -> None:
+        """Go on from a checkpoint, with other draws."""
+        kept = torch.load(path, map_location=self.device, weights_only=True)
+        self.steps, self.passed = kept["steps"], kept["passed"]
+        for name in ("network", "average", "optimizer"):
+            getattr(self, name).load_state_dict(kept[name])
+        torch.manual_seed(self.config.seed + self.steps)
+        random.seed(self.config.seed + self.steps)
+
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write the averaged weights."""
         commits = [{"first_step": 0, "commit": source_commit()}]
@@ -287,7 +303,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
     parser.add_argument("--recipe", type=Path, required=True, metavar="FILE.toml")
     parser.add_argument("--run", default="", metavar="NAME", help="of the recipe; not needed where it has only one")
-    parser.add_argument("--seconds", type=float, default=300.0, help="from the start of this script")
+    parser.add_argument("--seconds", type=float, default=300.0, help="in all, from the start of the script on")
     parser.add_argument("--clips", type=int, default=32, help="in a step, instead of the recipe's batch")
     parser.add_argument("--validation", type=Path, metavar="FOLDER")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
@@ -301,25 +317,30 @@ def main() -> None:
     run, tiles = Run(config, device), Tiles(options.packed, device)
     watched = Tiles(options.validation, device) if options.validation else None
     options.out.mkdir(parents=True, exist_ok=True)
-    weights, log = options.out / f"{config.model}.safetensors", list[str]()
-    next_look, losses = 0.0, list[Tensor]()
+    names = (f"{config.model}.safetensors", "log.jsonl", "run.pt")
+    weights, record, checkpoint = (options.out / name for name in names)
+    log, losses, next_look = list[str](), list[Tensor](), 0.0
+    if checkpoint.exists():
+        run.resume(checkpoint)
+        log, start = record.read_text("utf-8").splitlines(), start - run.passed
     while True:
-        passed = time.monotonic() - start
-        over = passed >= options.seconds
-        if over or passed >= next_look:
+        run.passed = time.monotonic() - start
+        over = run.passed >= options.seconds
+        if over or run.passed >= next_look:
             tiles.update()
-            row = {"step": run.steps, "seconds": round(passed, 1), "tiles": len(tiles.takes)}
+            row = {"step": run.steps, "seconds": round(run.passed, 1), "tiles": len(tiles.takes)}
             row["loss"] = round(torch.stack(losses).mean().item(), 4) if losses else None
             row |= validated(run.averaged, watched) if watched else {}
             log.append(json.dumps(row))
-            write_text(options.out / "log.jsonl", "\n".join(log) + "\n")
+            write_text(record, "\n".join(log) + "\n")
             print({name: value for name, value in row.items() if name != "takes"}, flush=True)
             run.save(weights, {"sequences": tiles.about, "credits": recipe.credits, "recipe": chosen.sha256})
+            run.keep(checkpoint)
             losses.clear()
-            next_look = time.monotonic() - start + LOOK
+            next_look = time.monotonic() - start + max(LOOK, options.seconds / LOOKS)
         if over:
             break
-        losses.append(run.step(tiles, options.clips, passed / options.seconds))
+        losses.append(run.step(tiles, options.clips, run.passed / options.seconds))
     print(weights)
 
 
