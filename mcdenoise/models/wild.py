@@ -1,11 +1,14 @@
 """The family ``wild``: one network for sequences and stills, that sees all light which the history holds.
 
-The layers are those of Open Image Denoise, and can start with the weights that it was published with. Beside the frame
-they see the accumulated radiance, which holds the samples of all frames that showed the same surface, how long that
-history is, and on request the previous result. Each pixel of the result is a weighted mean of the network's own image
-and of these: the history is right where it is long, the frame where it has many samples, so the error falls with every
-sample. The frame is in the place of the library's noisy image: where the history is late, from motion or from a pixel
-filter, the library's result of the accumulated radiance has up to 1.5 times the error of that of the frame.
+The layers are those of Open Image Denoise, and can start with the weights that it was published with. In the place of
+the library's noisy image they see the accumulated radiance, which holds the samples of all frames that showed the same
+surface; beside it the frame, how long the history is, and on request the previous result. Each pixel of the result is a
+weighted mean of the network's own image and of these: the history is right where it is long, the frame where it has
+many samples, so the error falls with every sample.
+
+Without training the library's result of the accumulated radiance is worse than that of the frame wherever the history
+is late or blurred: such noise looks like texture. A few minutes of training change that, at a low rate: five times the
+rate destroys what the library's weights know.
 """
 
 from __future__ import annotations
@@ -33,9 +36,9 @@ from mcdenoise.ops._window import corner
 
 History: TypeAlias = Literal["accumulated", "previous", "both"]
 
-# The frame, its albedo and normal as the library sees them; accumulated radiance, the previous result; the history.
+# Accumulated radiance, albedo and normal as the library sees them; the frame, the previous result; the history.
 _CHANNELS = 9 + 3 + 3 + 1
-# Initial logits of the network's image, of the accumulated radiance, of the previous result, and of the frame.
+# Initial logits of the network's image, of the frame, of the previous result, and of the accumulated radiance.
 _LOGITS = (0.0, -4.0, -4.0, -4.0)
 _LITTLE = -8.0  # that of the network's image, while its weights are random
 
@@ -83,14 +86,14 @@ class WildNetwork(nn.Module):
         color, albedo = frame.color, frame.albedo
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         alone = color if frame.current is None else frame.current
-        before, part = color, torch.zeros_like(color[:, :1])
+        before, part = alone, torch.zeros_like(color[:, :1])
         if self.previous and PREVIOUS in frame.extra:
             # Where there is none, the accumulated radiance is as good.
             part = frame.extra[PREVIOUS_WEIGHT]
             before = torch.lerp(color, frame.extra[PREVIOUS], part)
         part = (part if frame.length is None else 1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
         color, alone, before = (_lit(frame, image.to(color.dtype)) for image in (color, alone, before))
-        seen, images = tuned_input(alone, color, before, albedo, frame.normal, part, exposure, self.needs.stride)
+        seen, images = tuned_input(color, alone, before, albedo, frame.normal, part, exposure, self.needs.stride)
         predicted = corner(self._predicted(seen), *frame.size)
         image = tuned_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image if albedo is None else demodulate(image, albedo)), None
