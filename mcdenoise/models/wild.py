@@ -46,9 +46,10 @@ _LITTLE = -8.0  # that of the network's image, while its weights are random
 class WildNetwork(nn.Module):
     """The network: ``expand(sum_i w_i x_i)`` over four images ``x_i`` on the library's scale of radiance.
 
+    They are the image that the network predicts, the frame, the previous result and the accumulated radiance:
     ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where ``h`` is the
     part of the history in the accumulated radiance, ``1 - 1 / length``, or the weight of the previous result if none is
-    accumulated. So without a history only the network's image and the frame have a weight. Radiance is taken and
+    accumulated. So without a history only the network's image and the radiance have a weight. Radiance is taken and
     returned without its albedo, as :class:`mcdenoise.models.Demodulated` divides it out; the network works on the
     products. A missing albedo counts as one, a missing normal as zero.
 

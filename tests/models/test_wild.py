@@ -53,10 +53,10 @@ def test_the_image_is_the_weighted_mean_of_four_images(length: float | None, ste
     image = network(0.31, logits, stem)(frame)[0].image
     albedo, alone = frame.albedo, frame.color if frame.current is None else frame.current
     assert albedo is not None
-    radiance = [frame.color, frame.extra[PREVIOUS], alone]
+    radiance = [alone, frame.extra[PREVIOUS], frame.color]
     images = [remodulate(each, albedo) for each in radiance]
-    images[1] = torch.lerp(images[0], images[1], 0.4)
-    exposure, part = oidn_exposure(images[0]), 0.4 if length is None else 1 - 1 / length
+    images[1] = torch.lerp(images[2], images[1], 0.4)
+    exposure, part = oidn_exposure(images[2]), 0.4 if length is None else 1 - 1 / length
     weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
         [1, part, part, 1], dtype=torch.float64
     )
@@ -92,7 +92,7 @@ def test_it_starts_as_the_library() -> None:
         image, expected = model.eval()(frame)[0].image, library(frame)[0].image
     exposure = oidn_exposure(frame.color)
     difference = (compress(image * exposure) - compress(expected * exposure)).abs().max()
-    # The frame has a weight of e^-4 / (1 + e^-4), on a scale from 0 to 1.
+    # The radiance has a weight of e^-4 / (1 + e^-4), on a scale from 0 to 1.
     assert float(difference) < 0.02
 
 
