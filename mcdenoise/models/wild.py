@@ -139,7 +139,11 @@ def _wild(size: Size = "small", stem: int = 1, *, history: History = "accumulate
 register_family(
     _wild,
     "one network for sequences and stills, that sees the accumulated radiance",
-    {"wild": ("at full resolution", {}), "wild_small": ("at half resolution", {"stem": 2})},
+    {
+        "wild": ("at full resolution", {}),
+        "wild_small": ("at half resolution", {"stem": 2}),
+        "wild_large": ("at full resolution, with twice the multiplications", {"size": "base"}),
+    },
     kind="recurrent",
     paper="after Intel Open Image Denoise 2.5",
 )
