@@ -27,15 +27,10 @@ from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import parse_method
-from mcdenoise.models import (
-    PRECISIONS,
-    Accumulated,
-    Precision,
-    Skipping,
-    computing_in,
-    parts_of,
-    pretrained_models,
-)
+from mcdenoise.models import Accumulated, Skipping
+from mcdenoise.models._precision import PRECISIONS, Precision, computing_in
+from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.turns import interleaved
 
 OIDN = (

@@ -22,7 +22,9 @@ from torch import Tensor
 from mcdenoise import Denoiser, Frame, InputError
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import DEFAULT, TOLERANCE, Stage, summarize
+from mcdenoise.models import DEFAULT
+from mcdenoise.models._report import Stage, summarize
+from mcdenoise.models.skipping import TOLERANCE
 
 COLUMNS = ("scene", "shot", "skipped", "ms, all kept", "ms", "saved", "SMAPE, all kept", "SMAPE", "change")
 

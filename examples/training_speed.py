@@ -27,7 +27,8 @@ from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
-from mcdenoise.models import DEFAULT, Precision, create_model
+from mcdenoise.models import DEFAULT, create_model
+from mcdenoise.models._precision import Precision
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import check_config

@@ -17,7 +17,8 @@ from mcdenoise.data import Sequence
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import PRECISIONS, Precision, pretrained_models
+from mcdenoise.models._precision import PRECISIONS, Precision
+from mcdenoise.models._weights import pretrained_models
 from mcdenoise.reading import read_text
 from mcdenoise.results import Results
 from mcdenoise.user_cache import cache_file, keep

@@ -21,7 +21,8 @@ from mcdenoise.folder import denoise_sequence
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import display_codes
-from mcdenoise.models import DEFAULT, Output, find_model
+from mcdenoise.models import DEFAULT, Output
+from mcdenoise.models._registry import find_model
 from mcdenoise.report import check_packages, write_report
 from mcdenoise.results import FILE
 from mcdenoise.scenes.demo import demo_cameras, demo_scene

@@ -25,7 +25,9 @@ from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, tells_motion
-from mcdenoise.models import FrameReport, Output, Skipping, parts_of
+from mcdenoise.models import Output, Skipping
+from mcdenoise.models._report import FrameReport
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.sequence_report import SequenceReport
 
 # Largest fraction of pixels without a history, and smallest correlation of two images of the same place.

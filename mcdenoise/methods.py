@@ -12,7 +12,8 @@ from typing import Any
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.models import find_model, has_random_weights, model_of
+from mcdenoise.models._registry import find_model
+from mcdenoise.models._weights import has_random_weights, model_of
 
 WEIGHTS = ".safetensors"
 # A name or path, optionally followed by settings in parentheses.

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.models import Precision
+from mcdenoise.models._precision import Precision
 from mcdenoise.reading import read_text
 
 FILE = "results.json"
@@ -154,7 +154,7 @@ class Cell:
         failure: why the method failed on this scene; then all other values are unknown.
         computing: milliseconds per frame in memory, without reading and writing files; measured as a whole, so that the
             stages may add up to slightly less.
-        plan: the skipped stages and the reasons, see :func:`mcdenoise.models.summarize`.
+        plan: the skipped stages and the reasons.
         on_the_way: errors of the intermediate images, by stage, if they were requested.
         lacking: whether the method failed because the scene lacks buffers that it needs; then the run has not failed.
     """

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcdenoise.models import FrameReport, Stage, summarize
+from mcdenoise.models._report import FrameReport, Stage, summarize
 
 
 @dataclass

@@ -13,7 +13,8 @@ from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
-from mcdenoise.models import DEFAULT, model_of
+from mcdenoise.models import DEFAULT
+from mcdenoise.models._weights import model_of
 
 if TYPE_CHECKING:
     from mcdenoise.preview import Preview

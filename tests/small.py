@@ -4,7 +4,7 @@ import torch
 from torch import nn
 
 from mcdenoise import create_model
-from mcdenoise.models import parts_of
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.cascaded_v2 import PixelNetwork
 
 

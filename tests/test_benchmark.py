@@ -34,14 +34,8 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import evaluate_method
 from mcdenoise.frame import Frame
-from mcdenoise.models import (
-    Accumulated,
-    Demodulated,
-    Model,
-    Needs,
-    Output,
-    find_weights,
-)
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output
+from mcdenoise.models._weights import find_weights
 from mcdenoise.results import Cell, Method, Results
 
 METRICS = {"SMAPE", "relMSE", "PSNR", "SSIM", "tSMAPE", "tRMSE"}

@@ -11,7 +11,7 @@ from refusals import refused
 import mcdenoise.budget
 from mcdenoise.budget import Choice, choose_model
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.models import pretrained_models
+from mcdenoise.models._weights import pretrained_models
 from mcdenoise.results import Cell, Machine, Method, Results, Scene
 
 TIMES = {"cascaded_v2": 300.0, "cascaded_v2_small": 170.0, "cascaded_v2_tiny": 80.0, "cascaded_v2_micro": 50.0}

@@ -20,7 +20,8 @@ from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.cli import COMMANDS
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.models import list_models, pretrained_models
+from mcdenoise.models import list_models
+from mcdenoise.models._weights import pretrained_models
 
 
 @pytest.fixture

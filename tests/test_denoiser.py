@@ -14,7 +14,8 @@ from torch.utils import _pytree as pytree
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.data import open_sequence
-from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output, parts_of
+from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output
+from mcdenoise.models._wrapper import parts_of
 
 
 @pytest.fixture

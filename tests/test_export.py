@@ -17,8 +17,9 @@ from torch import Tensor, nn
 
 from mcdenoise import Frame, InputError, create_model
 from mcdenoise.export import Exported, Step, default_buffers, export_model, traced
-from mcdenoise.models import Demodulated, Model, Needs, Output, State, pretrained_models
+from mcdenoise.models import Demodulated, Model, Needs, Output, State
 from mcdenoise.models import Recurrent as Recurrence
+from mcdenoise.models._weights import pretrained_models
 
 # Sums in another order, through some thirty layers: this is the suite's bound for whole models, see tests/golden.
 RTOL, ATOL = 1e-4, 1e-5

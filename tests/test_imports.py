@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import mcdenoise.models
+
 PACKAGE = Path(__file__).resolve().parents[1] / "mcdenoise"
 MODULES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
@@ -221,3 +223,7 @@ def test_importing_is_quick() -> None:
         "from mcdenoise import *\nprint(time.process_time() - start)"
     )
     assert float(python(code)) < SECONDS
+
+
+def test_the_zoo_has_few_public_names() -> None:
+    assert len(mcdenoise.models.__all__) <= 25

@@ -18,7 +18,8 @@ from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import FrameReport, create_model
+from mcdenoise.models import create_model
+from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import Camera, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames

@@ -11,7 +11,9 @@ from pathlib import Path
 
 import mcdenoise.models
 from mcdenoise.check.cases import OPS
-from mcdenoise.models import ModelOverview, describe_weights, find_model, overview
+from mcdenoise.models import describe_weights, overview
+from mcdenoise.models._overview import ModelOverview
+from mcdenoise.models._registry import find_model
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = {

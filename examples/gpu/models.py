@@ -21,7 +21,8 @@ from part import SIZES, Part, difference, failure, milliseconds, shot
 from torch.utils import _pytree as pytree
 
 from mcdenoise import Denoiser, Frame, InputError, create_model
-from mcdenoise.models import DEFAULT, find_model, list_models
+from mcdenoise.models import DEFAULT, list_models
+from mcdenoise.models._registry import find_model
 from mcdenoise.ops import use
 
 # In this order, the most important first; then all others.

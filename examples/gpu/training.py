@@ -16,7 +16,8 @@ from typing import Any
 import torch
 from part import Part
 
-from mcdenoise.models import DEFAULT, Precision
+from mcdenoise.models import DEFAULT
+from mcdenoise.models._precision import Precision
 
 sys.path.append(str(Path(__file__).parents[1]))
 from training_speed import config_of, noise, steps

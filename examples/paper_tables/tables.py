@@ -43,7 +43,9 @@ from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS
-from mcdenoise.models import Output, compared_models, create_model, describe_weights, parts_of
+from mcdenoise.models import Output, create_model, describe_weights
+from mcdenoise.models._weights import compared_models
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.turns import interleaved
 

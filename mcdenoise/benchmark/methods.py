@@ -14,15 +14,11 @@ from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import Spelling, parse_method, split_methods
-from mcdenoise.models import (
-    PRECISIONS,
-    Skipping,
-    has_network,
-    list_models,
-    parts_of,
-    pretrained_models,
-)
+from mcdenoise.models import Skipping, list_models
+from mcdenoise.models._precision import PRECISIONS, has_network
 from mcdenoise.models._times import Times
+from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import FusionModule, LogFusion, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 

@@ -26,7 +26,8 @@ from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
-from mcdenoise.models import Output, Stage, summarize
+from mcdenoise.models import Output
+from mcdenoise.models._report import Stage, summarize
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 

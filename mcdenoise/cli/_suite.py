@@ -9,8 +9,9 @@ from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
 from mcdenoise.benchmark.tables import remarks
 from mcdenoise.cli._output import progress_bar, say, steps_of, write_json
 from mcdenoise.data.files import write_text
+from mcdenoise.denoiser._choice import EXACT, FILTERED
 from mcdenoise.errors import InputError
-from mcdenoise.models import DEFAULT, EXACT, FILTERED
+from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.shot import default_model
 from mcdenoise.suite import (

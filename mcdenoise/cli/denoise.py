@@ -29,7 +29,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence, prepare_folder
 from mcdenoise.frame import MOTION
 from mcdenoise.heap import keep_heap, return_heap
-from mcdenoise.models import pretrained_models
+from mcdenoise.models._weights import pretrained_models
 from mcdenoise.shot import ShotSettings
 
 # Formats in which nothing is written: such a name is meant as that of a file, and would become a folder's.

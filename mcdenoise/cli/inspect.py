@@ -66,7 +66,7 @@ def _users(sequence: Sequence) -> dict[str, list[str]]:
     if not (found := sorted(LIGHT_PARTS & sequence.buffers)):
         return {}
     # Imported here because it imports every model, which is slow.
-    from mcdenoise.models import users_of
+    from mcdenoise.models._overview import users_of
 
     return users_of(found)
 

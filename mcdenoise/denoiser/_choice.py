@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import DEFAULT, EXACT, FILTERED
+from mcdenoise.models import DEFAULT
 from mcdenoise.noise import noise_of
 from mcdenoise.sampling import has_exact_features
 
+# For features through a pixel filter, with noise, or of unknown origin.
+FILTERED = "oidn_tuned"
+# For features without noise, in stills and where the color has little.
+EXACT = "oidn_tuned_exact"
 # Level of noise of frames with some eight samples a pixel; training/README.md has the errors of both models.
 _MANY_SAMPLES = 0.1
 

@@ -21,21 +21,12 @@ from mcdenoise.denoiser._turns import in_turn, started
 from mcdenoise.denoiser._watch import REPEATED, Watch
 from mcdenoise.errors import InputError, level_of_caller
 from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
-from mcdenoise.models import (
-    DEFAULT,
-    Model,
-    Output,
-    State,
-    computing_in,
-    create_model,
-    fastest_precision,
-    has_network,
-)
+from mcdenoise.models import DEFAULT, Model, Output, State, create_model
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._layers import REST, alpha_of, completed, opened
 from mcdenoise.models._memory import Division, Frames, check_limits
-from mcdenoise.models._precision import Chosen, Precision
+from mcdenoise.models._precision import Chosen, Precision, computing_in, fastest_precision, has_network
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._times import Times, stages_of
@@ -64,8 +55,8 @@ class Denoiser:
     Args:
         model: the name of a model in the zoo (its shipped weights are loaded), your own ``path/to/file.py:factory`` or
             ``package.module:factory``, a :class:`mcdenoise.models.Model`, or a module or function whose parameters are
-            named like buffers, see :class:`mcdenoise.models.FromBuffers`. A module of yours is moved to the device,
-            made channels-last and put into evaluation mode. By default it is the one that the weights are for; without
+            named like buffers (one with a default value is optional). A module of yours is moved to the device, made
+            channels-last and put into evaluation mode. By default it is the one that the weights are for; without
             weights, the first frame chooses it, once, as in `mcdenoise denoise` (:func:`suitable_model`), and the
             report says which and why. Until then the attribute ``model`` is ``None``; see :meth:`pick`.
         weights: a safetensors file of other weights for a model given by name.
@@ -73,9 +64,9 @@ class Denoiser:
         precision: precision of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
             processors that support it; frames with hardly any noise, which it would make worse, are computed in float32
             all the same (on a GPU by the noise of the frame before, and the first one always). ``"auto"`` chooses it
-            for a trained model of the zoo if it is faster on this machine (see
-            :func:`mcdenoise.models.fastest_precision`), and float32 otherwise: for a model of yours, and with
-            ``differentiable``. The attribute ``precision`` holds the chosen precision, and the report the reason.
+            for a trained model of the zoo if it is faster on this machine, which is measured once, and float32
+            otherwise: for a model of yours, and with ``differentiable``. The attribute ``precision`` holds the chosen
+            precision, and the report the reason.
         keep_all: skip nothing, even if the scene does not need it, nor a frame that repeats the noise of the last one.
         tile: largest side of a tile in pixels, a multiple of 32 that is at least 64. The result is that of the whole
             image, up to the rounding of convolutions; overlapping margins cost time. By default tiles are as large as

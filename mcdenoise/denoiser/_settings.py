@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Sequence
 import torch
 
 from mcdenoise.errors import InputError, did_you_mean
-from mcdenoise.models import find_model
+from mcdenoise.models._registry import find_model
 
 
 def check_settings(model: object, given: Iterable[str], *, of: type, also: Collection[str] = ()) -> None:

@@ -30,8 +30,8 @@ def cut(numbers: Sequence[int], missing: Collection[int], length: int, overlap: 
         numbers: of all frames of the shot, ascending.
         missing: numbers of the frames to be written.
         length: largest number of frames in a piece; 0 does not cut the shot.
-        overlap: see :func:`mcdenoise.models.frames_remembered`; ``None`` for a method whose history has no known
-            length: the shot is not cut, and every frame is computed after all frames before it.
+        overlap: number of frames that the method remembers; ``None`` if its history has no known length: the shot is
+            not cut, and every frame is computed after all frames before it.
 
     Returns:
         The pieces in order; none where no frame is missing.

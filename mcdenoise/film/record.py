@@ -21,7 +21,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from mcdenoise.models import FrameReport
+from mcdenoise.models._report import FrameReport
 from mcdenoise.reading import read_bytes
 
 # Path, size, time of the last change in nanoseconds; a time of -1 is that of no file.

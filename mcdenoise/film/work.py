@@ -42,7 +42,8 @@ from mcdenoise.film.record import (
 )
 from mcdenoise.folder import FrameError, check_apart, new_report, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
-from mcdenoise.models import find_weights, frames_remembered
+from mcdenoise.models._remembered import frames_remembered
+from mcdenoise.models._weights import find_weights
 from mcdenoise.preview import Preview
 
 # Folder of the records, beside the shots.
@@ -101,7 +102,7 @@ class Found:
         shot: the shot, with the model that was picked, if none is named.
         numbers: numbers of all frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
-        overlap: number of frames that the history needs, see :func:`mcdenoise.models.frames_remembered`.
+        overlap: number of frames that the history needs.
         done: numbers of the finished frames.
     """
 

@@ -20,7 +20,7 @@ class Wrapper(nn.Module):
 
     Args:
         inner: any :class:`mcdenoise.models.Model`, or a module or function of images, see
-            :class:`mcdenoise.models.FromBuffers`.
+            :class:`mcdenoise.models._adapter.FromBuffers`.
     """
 
     inner: Model

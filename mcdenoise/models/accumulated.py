@@ -206,7 +206,7 @@ class Accumulated(Wrapper):
     # An attribute would be a setting for the training, which makes the wrappers at a model's outside anew.
     @property
     def persistence(self) -> float:
-        """The fraction of the history that each frame keeps, see :func:`mcdenoise.models.frames_remembered`."""
+        """The fraction of the history that each frame keeps."""
         return 1 - self.alpha_min
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:

@@ -64,7 +64,7 @@ class WithOidn(Wrapper):
         engine: "library", or "torch" for the same networks in torch
             (:class:`mcdenoise.models.oidn_open.OpenFilters`): they take half the time where the processor has bfloat16,
             and have derivatives; ``threads`` does not apply to them. "auto" is torch for frames that are denoised in
-            bfloat16 on a machine where :func:`mcdenoise.models.fastest_precision` is bfloat16, else the library.
+            bfloat16 on a machine where that is fastest, else the library.
         prefilter: quality of the filters that denoise the features. Those of high quality take two and a half times as
             long as the others; on frames of Cycles they improve ``oidn_clean`` by one to two percent.
         clean: whether to provide ``oidn_clean``, which takes most of the time. Without it, ``oidn_albedo`` is provided

@@ -14,7 +14,8 @@ import msgspec
 from msgspec import Meta
 
 from mcdenoise.errors import InputError, did_you_mean
-from mcdenoise.models import DEFAULT, Precision
+from mcdenoise.models import DEFAULT
+from mcdenoise.models._precision import Precision
 from mcdenoise.train.losses import Loss
 
 Schedule = Literal["constant", "cosine"]

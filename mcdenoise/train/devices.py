@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from mcdenoise.errors import InputError
-from mcdenoise.models import Precision
+from mcdenoise.models._precision import Precision
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric

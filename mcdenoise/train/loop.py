@@ -28,11 +28,11 @@ from mcdenoise.models import (
     State,
     create_model,
     describe_weights,
-    parts_of,
     save_weights,
     start_with,
 )
 from mcdenoise.models._defaults import plain_defaults
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData

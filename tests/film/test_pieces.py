@@ -15,7 +15,8 @@ from mcdenoise.film.manifest import Shot
 from mcdenoise.film.pieces import cut
 from mcdenoise.film.work import Order, make, scan
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import create_model, frames_remembered, list_models
+from mcdenoise.models import create_model, list_models
+from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.shot import ShotSettings
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import RADIANCE
-from mcdenoise.models import Model, find_model, list_models
+from mcdenoise.models import Model, list_models
+from mcdenoise.models._registry import find_model
 
 FILE = Path(__file__).with_name("golden.safetensors")
 # Those that call Open Image Denoise's library, and those that have no weights yet.

@@ -20,14 +20,14 @@ from mcdenoise.models import (
     Chain,
     Output,
     _registry,
-    as_model,
     create_model,
-    find_model,
     load_weights,
-    pretrained_models,
     register_model,
     save_weights,
 )
+from mcdenoise.models._adapter import as_model
+from mcdenoise.models._registry import find_model
+from mcdenoise.models._weights import pretrained_models
 from mcdenoise.models.recurrent import Recurrent
 
 HEIGHT, WIDE = 12, 16

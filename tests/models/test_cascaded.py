@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from toys import small, whole_frame
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import Chain, create_model, parts_of
+from mcdenoise.models import Chain, create_model
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.cascaded import KernelNetwork, PixelNetwork
 from mcdenoise.nn import auto_exposure
 

@@ -11,8 +11,9 @@ from toys import frame_of, small
 
 from mcdenoise import ops
 from mcdenoise.frame import Frame
-from mcdenoise.models import Chain, CoarseToFine, create_model, parts_of
+from mcdenoise.models import Chain, CoarseToFine, create_model
 from mcdenoise.models import cascaded_v2 as page
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.cascaded_v2 import KernelNetwork, PixelNetwork
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import cross_bilateral_weights, kernel_conv

@@ -21,7 +21,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from toys import Same, one_of_each, refused, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
-from mcdenoise.models import Accumulated, Demodulated, FrameReport, Output, _report, _times, list_models
+from mcdenoise.models import Accumulated, Demodulated, Output, _report, _times, list_models
+from mcdenoise.models._report import FrameReport
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._times import Times
 

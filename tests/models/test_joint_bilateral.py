@@ -7,7 +7,8 @@ from kornia.filters import joint_bilateral_blur
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
-from mcdenoise.models import Tiled, create_model, parts_of
+from mcdenoise.models import Tiled, create_model
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, remodulate

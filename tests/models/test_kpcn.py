@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from toys import frame_of
 
 from mcdenoise.frame import Frame, Hints
-from mcdenoise.models import create_model, parts_of
+from mcdenoise.models import create_model
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.kpcn import CHANNELS, KpcnNetwork
 from mcdenoise.ops import luminance_moments, moments_variance
 

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 from toys import Same, frame_of, one_of_each, refused, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, FrameReport, Needs, Output, Skipping, Tiled, list_models
+from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, Skipping, Tiled, list_models
 from mcdenoise.models._layers import REST, closed, fractions, split
+from mcdenoise.models._report import FrameReport
 from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.models.noisy import Noisy
 

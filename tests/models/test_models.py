@@ -28,20 +28,19 @@ from mcdenoise.models import (
     Model,
     Needs,
     Output,
-    as_model,
-    compared_models,
     create_model,
     describe_weights,
-    find_model,
     list_models,
     load_weights,
     overview,
-    parts_of,
-    prepared,
-    pretrained_models,
     register_model,
     save_weights,
 )
+from mcdenoise.models._adapter import as_model
+from mcdenoise.models._interface import prepared
+from mcdenoise.models._registry import find_model
+from mcdenoise.models._weights import compared_models, pretrained_models
+from mcdenoise.models._wrapper import parts_of
 
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"
 WIDTH = 8

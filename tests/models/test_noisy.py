@@ -6,7 +6,8 @@ import torch
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, parts_of
+from mcdenoise.models import Accumulated
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.noisy import Noisy
 
 

@@ -17,8 +17,8 @@ from toys import frame_of, refused, whole_frame
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
-from mcdenoise.models import create_model, has_network
-from mcdenoise.models._precision import Chosen, Precision
+from mcdenoise.models import create_model
+from mcdenoise.models._precision import Chosen, Precision, has_network
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import Mixed

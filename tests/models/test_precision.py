@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F
 
 from mcdenoise import Denoiser, Frame, InputError, denoise
-from mcdenoise.models import _precision, fastest_precision
-from mcdenoise.models._precision import ENVIRONMENT, _machine, _measured
+from mcdenoise.models import _precision
+from mcdenoise.models._precision import ENVIRONMENT, _machine, _measured, fastest_precision
 
 CPU = torch.device("cpu")
 

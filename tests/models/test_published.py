@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, create_model, parts_of
+from mcdenoise.models import Accumulated, create_model
 from mcdenoise.models._published import Network, displayed
+from mcdenoise.models._wrapper import parts_of
 
 WEARERS = ["bmfr", "cascaded", "kp", "kpcn", "layered", "mrkp", "nbgd", "sbmc", "wskp"]
 

@@ -13,19 +13,10 @@ from torch.utils import _pytree as pytree
 from toys import Blur, Mean, Same, Shot, Watching, report_of, small
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import (
-    Accumulated,
-    Chain,
-    Demodulated,
-    FrameReport,
-    Output,
-    Skipping,
-    Stage,
-    Tiled,
-    parts_of,
-    summarize,
-)
+from mcdenoise.models import Accumulated, Chain, Demodulated, Output, Skipping, Tiled
 from mcdenoise.models._noise_free import noise_free
+from mcdenoise.models._report import FrameReport, Stage, summarize
+from mcdenoise.models._wrapper import parts_of
 
 HEIGHT, WIDTH = 160, 224
 NORMAL = torch.tensor([0.0, 0.6, 0.8]).reshape(1, 3, 1, 1)

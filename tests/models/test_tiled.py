@@ -14,9 +14,12 @@ from toys import Blur, Brightest, Mean, Same, frame_of, refused, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import Skip
-from mcdenoise.models import Exposed, FromBuffers, Needs, Output, Region, Tiled, parts_of, prepared
+from mcdenoise.models import Exposed, Needs, Output, Tiled
+from mcdenoise.models._adapter import FromBuffers
+from mcdenoise.models._interface import prepared
 from mcdenoise.models._memory import Frames, Memory, Network, Tiling
-from mcdenoise.models.tiled import regions
+from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models.tiled import Region, regions
 from mcdenoise.ops._window import mirrored
 
 BUFFERS = frozenset({"color", "albedo", "normal", "depth"})

@@ -19,7 +19,6 @@ from mcdenoise.models import (
     CoarseToFine,
     Demodulated,
     Exposed,
-    FromBuffers,
     Model,
     Needs,
     Output,
@@ -27,9 +26,10 @@ from mcdenoise.models import (
     Skipping,
     Tiled,
     Wrapper,
-    parts_of,
-    prepared,
 )
+from mcdenoise.models._adapter import FromBuffers
+from mcdenoise.models._interface import prepared
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, downsample, remodulate
 from mcdenoise.ops._steps.network import low_frequencies_of

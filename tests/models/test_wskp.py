@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from test_cascaded import frame_of_doubles
 from torch import Tensor, nn
 
-from mcdenoise.models import Tiled, create_model, parts_of
+from mcdenoise.models import Tiled, create_model
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.wskp import Reparameterized, WskpNetwork
 
 

@@ -13,16 +13,9 @@ from torch import Tensor, nn
 from mcdenoise import ops
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models import (
-    Accumulated,
-    Demodulated,
-    FrameReport,
-    Model,
-    Needs,
-    Output,
-    create_model,
-    find_model,
-)
+from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, create_model
+from mcdenoise.models._registry import find_model
+from mcdenoise.models._report import FrameReport
 from mcdenoise.ops._backend import Backend
 
 

@@ -175,4 +175,5 @@ def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
 def test_a_place_without_things_has_a_camera_path() -> None:
     cameras = shoot(SceneBuilder((-5, 0, -5), (5, 3, 5)), np.random.default_rng(0), 3)
 
-    assert len(cameras) == 3 and np.isfinite([camera.to_world for camera in cameras]).all()
+    assert len(cameras) == 3
+    assert np.isfinite([camera.to_world for camera in cameras]).all()

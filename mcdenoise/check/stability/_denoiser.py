@@ -19,7 +19,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.methods import parse_method
-from mcdenoise.models import DEFAULT, Precision
+from mcdenoise.models import DEFAULT
+from mcdenoise.models._precision import Precision
 from mcdenoise.models.with_oidn import OIDN, OIDN_CLEAN
 
 FRAMES = 3

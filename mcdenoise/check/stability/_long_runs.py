@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check, bounded, held
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, FrameReport, Output, State
+from mcdenoise.models import Accumulated, Output, State
+from mcdenoise.models._report import FrameReport
 from mcdenoise.ops import accumulate
 from mcdenoise.ops.lag import THRESHOLD
 

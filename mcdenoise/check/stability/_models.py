@@ -14,7 +14,8 @@ from mcdenoise.check.stability._check import DTYPES, Check, bounded, held
 from mcdenoise.check.stability._rounding import Rounded
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
-from mcdenoise.models import Accumulated, Skipping, parts_of
+from mcdenoise.models import Accumulated, Skipping
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.ops import use
 
 EXPOSURES = (1e-4, 1e-2, 1e2, 1e4)
