@@ -4,11 +4,11 @@
     python examples/gpu/pack.py UNSEEN... -o packed-unseen
     python examples/gpu/train.py packed -o OUT --recipe recipes/wild.toml --run base --validation packed-unseen
 
-Parts may be added to the folder while it runs. Clips are drawn and augmented on the device, many at once, as
-:class:`mcdenoise.train.ClipSampler` draws them one by one; the learning rate follows the clock. The loss of a clip is
-the logarithm of its errors, so that a clip with little noise counts as much as one with much: what is reported of a
-method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are written again
-at each validation. The same command goes on where an interrupted run was.
+Parts may be added to the folder while it runs. Single frames with their history are drawn and augmented on the device,
+many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one; the learning rate follows the clock. The
+loss of a frame is the logarithm of its error, so that one with little noise counts as much as one with much: what is
+reported of a method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are
+written again at each validation. The same command goes on where an interrupted run was.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
+from mcdenoise.metrics import psnr_srgb, smape_linear
 from mcdenoise.models import save_weights
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
@@ -44,7 +44,6 @@ from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
 from mcdenoise.train.run_folder import about_weights
 
-FRAMES = 2
 LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least that many seconds apart
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a clip before its logarithm is taken
@@ -106,20 +105,17 @@ class Tiles:
         begun = slice(take["begun"], take["begun"] + take["frames"])
         return framed(self.fixed[own].float(), self.history[begun].float())
 
-    def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor, Tensor]:
-        """Draw clips: their frames as a batch, references, and whether the frames of a clip follow each other."""
+    def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor]:
+        """Draw single frames as a batch, and their references."""
         rand = torch.rand(8, clips, device=self.device)
         # As often as it has frames.
         drawn = torch.multinomial(self.table[:, 2].float(), clips, replacement=True)
         first, begun, frames, histories = self.table[drawn].unbind(1)
-        moving = frames > 1
-        t = (rand[0] * (frames - FRAMES + 1).clamp_min(1)).long()
-        t = torch.stack([t, t + moving], 1)
-        when = (first[:, None] + t).flatten()
-        which = (begun[:, None] + (rand[1] * histories).long()[:, None] * frames[:, None] + t).flatten()
+        t = (rand[0] * frames).long()
+        when, which = first + t, begun + (rand[1] * histories).long() * frames + t
         sides = torch.arange(config.crop, device=self.device)
         top, left = (((side - config.crop + 1) * r).long() for side, r in zip(TILE, rand[2:4], strict=True))
-        rows, columns = ((start[:, None] + sides).repeat_interleave(FRAMES, 0) for start in (top, left))
+        rows, columns = (start[:, None] + sides for start in (top, left))
         place = (when[:, None, None], slice(None), rows[:, :, None], columns[:, None, :])
         # Pixels come first: channels-last images.
         fixed, history = self.fixed[place], self.history[(which[:, None, None], *place[1:])]
@@ -128,7 +124,7 @@ class Tiles:
         fixed, history = (
             images.rot90(turns, (1, 2)).flip(flip).permute(0, 3, 1, 2).float() for images in (fixed, history)
         )
-        return *augmented(fixed, history, rand[4:], config), moving
+        return augmented(fixed, history, rand[4:], config)
 
 
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
@@ -138,16 +134,11 @@ def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
     return frame, reference
 
 
-def each_frame(values: Tensor) -> Tensor:
-    """One value for each frame from one for each clip: ``(B T, 1, 1, 1)``."""
-    return values.repeat_interleave(FRAMES, 0).reshape(-1, 1, 1, 1)
-
-
 def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Frame, Tensor]:
     """Colors and axes permuted, light scaled, histories and features dropped, lamps."""
-    clips, device = len(fixed) // FRAMES, fixed.device
+    clips, device = len(fixed), fixed.device
     frame, reference = framed(fixed, history)
-    order, axes = (torch.rand(clips, 3, device=device).argsort(1).repeat_interleave(FRAMES, 0) for _ in range(2))
+    order, axes = (torch.rand(clips, 3, device=device).argsort(1) for _ in range(2))
 
     def permuted(image: Tensor, by: Tensor) -> Tensor:
         return image.gather(1, by[:, :, None, None].expand_as(image))
@@ -155,14 +146,14 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
     current, color, albedo, reference = (
         permuted(e, order) for e in (frame.current, frame.color, frame.albedo, reference)
     )
-    signs = (torch.rand(clips, 3, device=device) > 0.5).float().mul(2).sub(1).repeat_interleave(FRAMES, 0)
+    signs = (torch.rand(clips, 3, device=device) > 0.5).float().mul(2).sub(1)
     normal = permuted(frame.normal, axes) * signs[:, :, None, None]
     stops = config.exposure * (2 * rand[0] - 1)[:, None] + config.tint * (2 * torch.rand(clips, 3, device=device) - 1)
-    factor = torch.exp2(stops).repeat_interleave(FRAMES, 0)[:, :, None, None]
+    factor = torch.exp2(stops)[:, :, None, None]
     if config.key:
-        factor = factor * auto_exposure(reference[::FRAMES], config.key).repeat_interleave(FRAMES, 0)
+        factor = factor * auto_exposure(reference, config.key)
     current, color, reference = (image * factor for image in (current, color, reference))
-    young = each_frame(rand[1] < YOUNG)
+    young = (rand[1] < YOUNG).reshape(-1, 1, 1, 1)
     color, length = torch.where(young, current, color), torch.where(young, 1, frame.length)
     if config.lamps:
         inside, radiance, grey = lamps(reference, rand, config)
@@ -170,8 +161,8 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
         light = demodulate(radiance, grey.expand_as(radiance))
         color, current = (torch.where(inside, light, image) for image in (color, current))
         reference = torch.where(inside, radiance, reference)
-    normal = normal * each_frame(rand[3] > BARE)
-    bare = each_frame(rand[3] < BARE / 2)
+    normal = normal * (rand[3] > BARE).reshape(-1, 1, 1, 1)
+    bare = (rand[3] < BARE / 2).reshape(-1, 1, 1, 1)
     color, current = (torch.where(bare, remodulate(image, albedo), image) for image in (color, current))
     albedo = torch.where(bare, 1, albedo)
     given = {"color": color, "current": current, "length": length, "albedo": albedo, "normal": normal}
@@ -181,26 +172,24 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
 
 def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:
     """Where lamps are, their radiance and albedo."""
-    clips, side = len(reference) // FRAMES, torch.arange(config.crop, device=reference.device)
+    clips, side = len(reference), torch.arange(config.crop, device=reference.device)
     own = torch.rand(7, clips, device=reference.device)
     sizes = 2 + own[:2] * (config.crop // 3)
     starts = own[2:4] * (config.crop - sizes)
     rows, columns = ((side >= s[:, None]) & (side < (s + n)[:, None]) for s, n in zip(starts, sizes, strict=True))
     inside = (rows[:, :, None] & columns[:, None, :] & (rand[2] < config.lamps)[:, None, None])[:, None]
     tint = 0.7 + 0.6 * torch.rand(clips, 3, 1, 1, device=reference.device)
-    mean = reference[::FRAMES].mean((1, 2, 3), keepdim=True)
+    mean = reference.mean((1, 2, 3), keepdim=True)
     radiance = mean * torch.pow(30.0, own[4]).reshape(-1, 1, 1, 1) * tint
     grey = (own[5] * (own[6] > 0.5)).reshape(-1, 1, 1, 1)
-    return tuple(each.repeat_interleave(FRAMES, 0) for each in (inside, radiance, grey))
+    return inside, radiance, grey
 
 
-def errors(image: Tensor, reference: Tensor, moving: Tensor, config: TrainConfig) -> Tensor:
-    """The logarithm of the error of each clip."""
-    image, reference = (each.unflatten(0, (-1, FRAMES)) for each in (image, reference))
-    spatial = smape_linear(image, reference).mean(1)
-    total = spatial + config.display_weight * display_error(image, reference).mean(1)
-    total = total + config.temporal_weight * moving * temporal_smape_linear(image, reference)
-    return torch.log(total + RELATIVE)
+def errors(image: Tensor, reference: Tensor, config: TrainConfig) -> Tensor:
+    """The logarithm of the error of each frame."""
+    return torch.log(
+        smape_linear(image, reference) + config.display_weight * display_error(image, reference) + RELATIVE
+    )
 
 
 @torch.no_grad()
@@ -254,11 +243,11 @@ class Run:
         rate = min(1.0, (self.steps + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * rate
-        frame, reference, moving = tiles.draw(config, clips)
+        frame, reference = tiles.draw(config, clips)
         # Most CPUs emulate half precision.
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             image = self.rest(frame)[0].image
-        loss = errors(image.float(), reference, moving, config).mean()
+        loss = errors(image.float(), reference, config).mean()
         self.optimizer.zero_grad()
         loss.backward()
         for weight in self.network.parameters():
@@ -304,7 +293,7 @@ def main() -> None:
     parser.add_argument("--recipe", type=Path, required=True, metavar="FILE.toml")
     parser.add_argument("--run", default="", metavar="NAME", help="of the recipe; not needed where it has only one")
     parser.add_argument("--seconds", type=float, default=300.0, help="in all, from the start of the script on")
-    parser.add_argument("--clips", type=int, default=32, help="in a step, instead of the recipe's batch")
+    parser.add_argument("--clips", type=int, default=32, help="single frames in a step, instead of the recipe's batch")
     parser.add_argument("--validation", type=Path, metavar="FOLDER")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     options = parser.parse_args()
@@ -313,7 +302,7 @@ def main() -> None:
     torch.backends.cudnn.benchmark = True
     recipe = Recipe.read(options.recipe, options_of("generate"))
     (chosen,) = recipe.chosen([options.run] if options.run else [recipe.runs[0].name])
-    config = replace(chosen.config, batch=options.clips, frames=FRAMES)
+    config = replace(chosen.config, batch=options.clips, frames=1, temporal_weight=0.0)
     run, tiles = Run(config, device), Tiles(options.packed, device)
     watched = Tiles(options.validation, device) if options.validation else None
     options.out.mkdir(parents=True, exist_ok=True)
@@ -325,7 +314,7 @@ def main() -> None:
         log, start = record.read_text("utf-8").splitlines(), start - run.passed
     while True:
         run.passed = time.monotonic() - start
-        over = run.passed >= options.seconds
+        over = run.passed >= options.seconds and run.steps > 0
         if over or run.passed >= next_look:
             tiles.update()
             row = {"step": run.steps, "seconds": round(run.passed, 1), "tiles": len(tiles.takes)}
