@@ -1,14 +1,11 @@
 """The family ``wild``: one network for sequences and stills, that sees all light which the history holds.
 
 The layers are those of Open Image Denoise, and can start with the weights that it was published with. In the place of
-the library's noisy image they see the accumulated radiance, which holds the samples of all frames that showed the same
-surface; beside it the frame, how long the history is, and on request the previous result. Each pixel of the result is a
-weighted mean of the network's own image and of these: the history is right where it is long, the frame where it has
-many samples, so the error falls with every sample.
-
-Without training the library's result of the accumulated radiance is worse than that of the frame wherever the history
-is late or blurred: such noise looks like texture. A few minutes of training change that, at a low rate: five times the
-rate destroys what the library's weights know.
+the library's noisy image they see a mean of the frame and of the accumulated radiance, which holds the samples of all
+frames that showed the same surface. A small network weighs both: the history has less noise, but is late or blurred
+where light changes and where pixels move by fractions. Beside it the layers see the frame, how long the history is, and
+on request the previous result. Each pixel of the result is a weighted mean of the network's own image and of these, so
+the error falls with every sample.
 """
 
 from __future__ import annotations
@@ -31,22 +28,81 @@ from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT, Recurrent
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops._steps.transfer import compress
 from mcdenoise.ops._steps.tuned import tuned_choice, tuned_input
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, up_to_multiple
 
 History: TypeAlias = Literal["accumulated", "previous", "both"]
 
-# Accumulated radiance, albedo and normal as the library sees them; the frame, the previous result; the history.
+# The mean of frame and history, albedo, normal as the library sees them; the frame, the previous result; the history.
 _CHANNELS = 9 + 3 + 3 + 1
-# Initial logits of the network's image, of the frame, of the previous result, and of the accumulated radiance.
+# Initial logits of the network's image, of the frame, of the previous result, and of the mean.
 _LOGITS = (0.0, -4.0, -4.0, -4.0)
 _LITTLE = -8.0  # that of the network's image, while its weights are random
+# The network for the weight of the history: side of the blocks that it sees, channels, the initial logit, and the
+# factor of its last layer, by which it learns faster than the layers that start with weights.
+_BLOCK, _WIDTH, _TRUST, _PACE = 4, 24, 1.5, 16.0
+_FIGURES = 11
+_LEAST = 3e-3  # smallest difference that matters, on the library's scale
+
+
+class Trust(nn.Module):
+    """The weight of the accumulated radiance beside the frame, from what both show in blocks of 4x4 pixels.
+
+    Of each block it sees the means of both, the mean absolute difference, the difference of the means, both standard
+    deviations, and the part of the history: a difference of single pixels is noise, one of means is late light. And the
+    standard deviations of albedo and normal, and how many pixels show a surface at all: a background has no noise, and
+    radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes.
+    """
+
+    reach = 3 * _BLOCK + 2 * _BLOCK
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for entering in (_FIGURES, _WIDTH, _WIDTH):
+            layers += [nn.Conv2d(entering, _WIDTH, 3, padding=1, padding_mode="replicate"), nn.ReLU()]
+        self.layers, self.last = nn.Sequential(*layers), nn.Conv2d(_WIDTH, 1, 1)
+        assert self.last.bias is not None
+        with torch.no_grad():
+            self.last.weight.mul_(0.1 / _PACE)
+            self.last.bias.fill_(_TRUST / _PACE)
+
+    def forward(
+        self, alone: Tensor, color: Tensor, part: Tensor, albedo: Tensor | None, normal: Tensor | None
+    ) -> Tensor:
+        """The weight ``(B, 1, H, W)``.
+
+        Args:
+            alone: ``(B, 3, H, W)`` the frame, in [0, 1] on the library's scale.
+            color: ``(B, 3, H, W)`` likewise, the accumulated radiance.
+            part: ``(B, 1, H, W)`` part of the history in it.
+            albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
+            normal: likewise; ``None`` counts as zero.
+        """
+        albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0, 1)
+        normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1, 1)
+        own, both, surface = (image.mean(1, keepdim=True) for image in (alone, color, albedo))
+        apart, lengths = (own - both).abs(), normal.square().sum(1, keepdim=True)
+        each = torch.cat(
+            [own, both, surface, own * own, both * both, surface * surface, apart, part, lengths, normal], 1
+        )
+        blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
+        means, squares, apart, part, lengths, normal = blocks.split([3, 3, 1, 1, 1, 3], 1)
+        variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
+        own, both, _ = means.split(1, 1)
+        differences = torch.cat([apart, (own - both).abs(), variances.clamp_min(_LEAST**2).sqrt()], 1)
+        seen = [own, both, (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
+        logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
+        wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
+        return corner(wide, *alone.shape[-2:])
 
 
 class WildNetwork(nn.Module):
     """The network: ``expand(sum_i w_i x_i)`` over four images ``x_i`` on the library's scale of radiance.
 
-    They are the image that the network predicts, the frame, the previous result and the accumulated radiance:
+    They are the image that the network predicts, the frame, the previous result (where it is not seen, the accumulated
+    radiance), and the mean of the frame and the accumulated radiance, see :class:`Trust`:
     ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where ``h`` is the
     part of the history in the accumulated radiance, ``1 - 1 / length``, or the weight of the previous result if none is
     accumulated. So without a history only the network's image and the radiance have a weight. Radiance is taken and
@@ -69,6 +125,7 @@ class WildNetwork(nn.Module):
             raise InputError(f"stem: expected at least 1, found {stem}")
         self.stem, self.previous, blocks = stem, previous, stem * stem
         self.unet = OidnUNet(_CHANNELS * blocks, size, out_channels=(3 + len(_LOGITS)) * blocks)
+        self.trust = Trust()
         # With random weights, the result first is the radiance that was given; other weights come with their own.
         last = self.unet.last
         assert last.bias is not None
@@ -76,7 +133,8 @@ class WildNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.bias.zero_()[3].fill_(_LITTLE)
         uses, unet = {"current", "length", "albedo", "normal", *((PREVIOUS, PREVIOUS_WEIGHT) * previous)}, self.unet
-        self.needs = Needs(uses=frozenset(uses), reach=stem * unet.reach, stride=stem * unet.multiple, live=unet.live)
+        reach = stem * unet.reach + Trust.reach
+        self.needs = Needs(uses=frozenset(uses), reach=reach, stride=stem * unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
@@ -87,13 +145,16 @@ class WildNetwork(nn.Module):
         color, albedo = frame.color, frame.albedo
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         alone = color if frame.current is None else frame.current
-        before, part = alone, torch.zeros_like(color[:, :1])
+        before, part = color, torch.zeros_like(color[:, :1])
         if self.previous and PREVIOUS in frame.extra:
             # Where there is none, the accumulated radiance is as good.
             part = frame.extra[PREVIOUS_WEIGHT]
             before = torch.lerp(color, frame.extra[PREVIOUS], part)
         part = (part if frame.length is None else 1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
         color, alone, before = (_lit(frame, image.to(color.dtype)) for image in (color, alone, before))
+        if frame.length is not None:
+            shown = (compress(image * exposure) for image in (alone, color))
+            color = torch.lerp(alone, color, self.trust(*shown, part, albedo, frame.normal))
         seen, images = tuned_input(color, alone, before, albedo, frame.normal, part, exposure, self.needs.stride)
         predicted = corner(self._predicted(seen), *frame.size)
         image = tuned_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)

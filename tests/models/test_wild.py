@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from toys import frame_of, refused
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
-from mcdenoise.models.wild import _LOGITS, WildNetwork
+from mcdenoise.models.wild import _LOGITS, _PACE, Trust, WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.ops._steps.transfer import compress, expand
@@ -42,6 +43,8 @@ def network(own: float, logits: tuple[float, ...], stem: int) -> WildNetwork:
     with torch.no_grad():
         made.unet.last.weight.zero_()
         bias.zero_()[:7] = torch.tensor(predicted, dtype=torch.float64)
+        made.trust.last.weight.zero_()
+        made.trust.last.bias.fill_(math.log(0.7 / 0.3) / _PACE)
     return made
 
 
@@ -56,7 +59,8 @@ def test_the_image_is_the_weighted_mean_of_four_images(length: float | None, ste
     radiance = [alone, frame.extra[PREVIOUS], frame.color]
     images = [remodulate(each, albedo) for each in radiance]
     images[1] = torch.lerp(images[2], images[1], 0.4)
-    exposure, part = oidn_exposure(images[2]), 0.4 if length is None else 1 - 1 / length
+    images[2] = images[2] if length is None else torch.lerp(images[0], images[2], 0.7)
+    exposure, part = oidn_exposure(remodulate(frame.color, albedo)), 0.4 if length is None else 1 - 1 / length
     weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
         [1, part, part, 1], dtype=torch.float64
     )
@@ -70,6 +74,21 @@ def test_the_previous_result_is_seen_on_request_only() -> None:
     model, frame = WildNetwork().double().eval(), given(4.0)
     assert PREVIOUS not in model.needs.uses
     assert torch.equal(model(frame)[0].image, model(frame.replace(extra={}))[0].image)
+
+
+def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
+    """The figures, not the weights, which are random: noise of single pixels, or another mean of the whole block."""
+    torch.manual_seed(0)
+    trust, flat = Trust().double(), torch.full((1, 3, *SIZE), 0.5, dtype=torch.float64)
+    part, noise = torch.full_like(flat[:, :1], 0.9), 0.1 * torch.ones_like(flat)
+    noise[..., ::2] *= -1
+
+    def weight(alone: torch.Tensor) -> torch.Tensor:
+        return trust(alone, flat, part, None, None)
+
+    assert weight(flat).shape == (1, 1, *SIZE)
+    torch.testing.assert_close(weight(flat + noise), weight(flat - noise))
+    assert not torch.allclose(weight(flat + noise), weight(flat + 0.1))
 
 
 def test_every_pixel_of_a_block_has_its_own_prediction() -> None:
