@@ -25,6 +25,7 @@ from mcdenoise.models._layers import answered
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT, Recurrent
+from mcdenoise.models.skipping import Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -193,7 +194,7 @@ def _wild(size: Size = "small", stem: int = 1, *, history: History = "accumulate
     if history not in ("accumulated", "previous", "both"):
         raise InputError(f"history: expected accumulated, previous or both, found '{history}'")
     model: Model = Tiled(WildNetwork(size, stem, previous=history != "accumulated"))
-    model = model if history == "accumulated" else Recurrent(model)
+    model = Skipping(model, alpha_min=alpha_min) if history == "accumulated" else Recurrent(model)
     return Demodulated(model if history == "previous" else Accumulated(model, alpha_min=alpha_min))
 
 
