@@ -38,7 +38,7 @@ History: TypeAlias = Literal["accumulated", "previous", "both"]
 # The mean of frame and history, albedo, normal as the library sees them; the frame, the previous result; the history.
 _CHANNELS = 9 + 3 + 3 + 1
 # Initial logits of the network's image, of the frame, of the previous result, and of the mean.
-_LOGITS = (0.0, -4.0, -4.0, -4.0)
+_LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -8.0  # that of the network's image, while its weights are random
 # The network for the weight of the history: side of the blocks that it sees, channels, the initial logit, and the
 # factor of its last layer, by which it learns faster than the layers that start with weights.
@@ -132,7 +132,8 @@ class WildNetwork(nn.Module):
         assert last.bias is not None
         with torch.no_grad():
             last.weight.mul_(0.1)
-            last.bias.zero_()[3].fill_(_LITTLE)
+            last.weight[3:].div_(_PACE)
+            last.bias.zero_()[3].fill_(_LITTLE / _PACE)
         uses, unet = {"current", "length", "albedo", "normal", *((PREVIOUS, PREVIOUS_WEIGHT) * previous)}, self.unet
         reach = stem * unet.reach + Trust.reach
         self.needs = Needs(uses=frozenset(uses), reach=reach, stride=stem * unet.multiple, live=unet.live)
@@ -157,7 +158,8 @@ class WildNetwork(nn.Module):
             shown = (compress(image * exposure) for image in (alone, color))
             color = torch.lerp(alone, color, self.trust(*shown, part, albedo, frame.normal))
         seen, images = tuned_input(color, alone, before, albedo, frame.normal, part, exposure, self.needs.stride)
-        predicted = corner(self._predicted(seen), *frame.size)
+        image, logits = corner(self._predicted(seen), *frame.size).split([3, len(_LOGITS)], 1)
+        predicted = torch.cat([image, _PACE * logits], 1)
         image = tuned_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image if albedo is None else demodulate(image, albedo)), None
 
