@@ -39,10 +39,10 @@ History: TypeAlias = Literal["accumulated", "previous", "both"]
 _CHANNELS = 9 + 3 + 3 + 1
 # Initial logits of the network's image, of the frame, of the previous result, and of the mean.
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
-_LITTLE = -8.0  # that of the network's image, while its weights are random
-# The network for the weight of the history: side of the blocks that it sees, channels, the initial logit, and the
-# factor of its last layer, by which it learns faster than the layers that start with weights.
-_BLOCK, _WIDTH, _TRUST, _PACE = 4, 24, 1.5, 16.0
+_LITTLE = -12.0  # that of the network's image, while its weights are random
+_PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
+# The network for the weight of the history: side of the blocks that it sees, channels, and the initial logit.
+_BLOCK, _WIDTH, _TRUST = 4, 24, 1.5
 _FIGURES = 11
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
