@@ -19,8 +19,7 @@ from torch import nn
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import psnr_srgb, smape_linear
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, load_weights
-from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, answered, load_weights, with_carried
 from mcdenoise.models.mrkp import Backbone
 from mcdenoise.models.wskp import SIDES
 from mcdenoise.nn import normalize_depth

@@ -9,7 +9,8 @@ from types import ModuleType
 import pytest
 
 from mcdenoise.check.cases import OPS
-from mcdenoise.models import list_models, overview
+from mcdenoise.models import list_models
+from mcdenoise.models._overview import overview
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -21,7 +21,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.png import Picture
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import display_codes, psnr_srgb, smape_linear
-from mcdenoise.models import overview
+from mcdenoise.models._overview import overview
 
 FOLDER = Path(__file__).resolve().parents[1] / "close_ups"
 # Left, top, width and height in pixels: books on a shelf, and a rough metal ball beside a glass one.

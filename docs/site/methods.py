@@ -11,8 +11,8 @@ from pathlib import Path
 
 import mcdenoise.models
 from mcdenoise.check.cases import OPS
-from mcdenoise.models import describe_weights, overview
-from mcdenoise.models._overview import ModelOverview
+from mcdenoise.models import describe_weights
+from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import find_model
 
 ROOT = Path(__file__).resolve().parents[2]

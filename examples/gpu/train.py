@@ -46,9 +46,9 @@ from mcdenoise.train.run_folder import about_weights
 
 LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least that many seconds apart
 WARM_UP = 200
-RELATIVE = 0.01  # added to the error of a clip before its logarithm is taken
-BARE = 0.06  # probability that a clip has no normal, and half that of one without albedo
-YOUNG = 0.1  # probability that a clip has no history
+RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
+BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
+YOUNG = 0.1  # probability that a frame has no history
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 

@@ -9,8 +9,7 @@ from rich.table import Column, Table
 
 from mcdenoise.cli._options import Flag, Json
 from mcdenoise.cli._output import console_of_tables, print_rows, show, warn, write_json
-from mcdenoise.models import overview
-from mcdenoise.models._overview import ModelOverview
+from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import troubles
 
 # In a narrower terminal the descriptions take the place of these columns.

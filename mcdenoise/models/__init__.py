@@ -2,7 +2,7 @@
 
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
-from mcdenoise.models._overview import overview
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._registry import list_models
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, save_weights, start_with
 from mcdenoise.models._wrapper import Wrapper
@@ -35,12 +35,13 @@ __all__ = [
     "State",
     "Tiled",
     "Wrapper",
+    "answered",
     "create_model",
     "describe_weights",
     "list_models",
     "load_weights",
-    "overview",
     "register_model",
     "save_weights",
     "start_with",
+    "with_carried",
 ]

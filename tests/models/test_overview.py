@@ -11,8 +11,9 @@ from typing import get_args
 import pytest
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import _registry, list_models, overview, register_model
+from mcdenoise.models import _registry, list_models, register_model
 from mcdenoise.models._entries import Kind
+from mcdenoise.models._overview import overview
 from mcdenoise.models.oidn_open import archive_of_library
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, list_models
-from mcdenoise.models import _registry, overview
-from mcdenoise.models._overview import users_of
+from mcdenoise.models import _registry
+from mcdenoise.models._overview import overview, users_of
 from mcdenoise.models._registry import troubles
 
 # The source of a module that offers the factory `make`, and a part of the reason why it is no model.
