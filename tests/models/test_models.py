@@ -32,12 +32,12 @@ from mcdenoise.models import (
     describe_weights,
     list_models,
     load_weights,
-    overview,
     register_model,
     save_weights,
 )
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import prepared
+from mcdenoise.models._overview import overview
 from mcdenoise.models._registry import find_model
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.models._wrapper import parts_of
