@@ -34,6 +34,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import psnr_srgb, smape_linear
 from mcdenoise.models import save_weights
+from mcdenoise.models._precision import fastest_precision
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -48,7 +49,7 @@ LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least tha
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
-YOUNG = 0.1  # probability that a frame has no history
+YOUNG = 0.25  # probability that a frame has no history
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 
@@ -235,6 +236,7 @@ class Run:
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.rest, self.averaged = split(self.network)[1], split(self.average)[1]
+        self.rounded = fastest_precision(self.device).precision == "bfloat16"
         self.steps, self.passed = 0, 0.0
 
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
@@ -245,7 +247,7 @@ class Run:
             group["lr"] = config.learning_rate * rate
         frame, reference = tiles.draw(config, clips)
         # Most CPUs emulate half precision.
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.rounded):
             image = self.rest(frame)[0].image
         loss = errors(image.float(), reference, config).mean()
         self.optimizer.zero_grad()

@@ -120,7 +120,7 @@ class WildNetwork(nn.Module):
         InputError: ``stem`` is below 1.
     """
 
-    def __init__(self, size: Size = "small", stem: int = 1, *, previous: bool = False) -> None:
+    def __init__(self, size: Size = "base", stem: int = 1, *, previous: bool = False) -> None:
         super().__init__()
         if stem < 1:
             raise InputError(f"stem: expected at least 1, found {stem}")
@@ -181,7 +181,7 @@ def _lit(frame: Frame, image: Tensor) -> Tensor:
     return image if frame.albedo is None else remodulate(image, frame.albedo)
 
 
-def _wild(size: Size = "small", stem: int = 1, *, history: History = "accumulated", alpha_min: float = 0.03) -> Model:
+def _wild(size: Size = "base", stem: int = 1, *, history: History = "accumulated", alpha_min: float = 0.03) -> Model:
     """The network behind its history.
 
     Args:
@@ -204,9 +204,9 @@ register_family(
     _wild,
     "one network for sequences and stills, that sees the accumulated radiance",
     {
-        "wild": ("at full resolution", {}),
-        "wild_small": ("at half resolution", {"stem": 2}),
-        "wild_large": ("at full resolution, with twice the multiplications", {"size": "base"}),
+        "wild": ("with 125 thousand multiplications a pixel", {}),
+        "wild_small": ("at half resolution, with 16 thousand", {"size": "small", "stem": 2}),
+        "wild_large": ("with 312 thousand", {"size": "large"}),
     },
     kind="recurrent",
     paper="after Intel Open Image Denoise 2.5",
