@@ -38,7 +38,7 @@ _PICTURES = 6
 # Open Image Denoise in the setting that has the smallest errors on sequences, see docs/results.md.
 PEER = "oidn(quality=high, auxiliary=clean, source=accumulated after)"
 # Beside the baselines and the chosen model: a filter of each kind, Open Image Denoise, and models with shipped weights.
-COMPARED = f"{PEER},joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,cascaded_v2,cascaded_v2_small,oidn_tuned"
+COMPARED = f"{PEER},joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,wild_small,wild,wild_large"
 # The close-ups of the picture: left, top, width and height as fractions of the image.
 _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
 

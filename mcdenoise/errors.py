@@ -32,8 +32,8 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A question that offers the known names nearest to one that is unknown; empty if none is near.
 
     Example:
-        >>> did_you_mean("oidn-tuned", ["noisy", "oidn_tuned"])
-        'did you mean oidn_tuned?'
+        >>> did_you_mean("wild-small", ["noisy", "wild_small"])
+        'did you mean wild_small?'
     """
     near = get_close_matches(name.lower(), known)
     return f"did you mean {' or '.join(near)}?" if near else ""

@@ -289,9 +289,6 @@ def denoised_frames(
 
 def _begin(sequence: Sequence, denoiser: Denoiser, reference: bool, of: int) -> tuple[frozenset[str], bool]:
     """Reset the denoiser; return the buffers that it uses, and whether it has a history."""
-    if denoiser.model is None:
-        denoiser.reset(frames=of)
-        denoiser.pick(sequence.first_valid_frame())
     wanted = denoiser.model.needs.buffers | denoiser.model.needs.uses
     buffers = sequence.buffers - (set() if reference else {"reference"}) - (LIGHT_PARTS - wanted)
     denoiser.reset(buffers, of, sequence.size, len(sequence.lights))

@@ -74,7 +74,7 @@ def parse_method(text: str) -> Spelling:
     """Parse a method.
 
     Args:
-        text: such as ``"cascaded_v2(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/cascaded_v2.safetensors"``,
+        text: such as ``"wild(alpha_min=0.2)"``, ``"oidn(quality=fast)"``, ``"run/wild.safetensors"``,
             ``"mine.py:make"`` or, with weights, ``"mine.py:make(weights=run/make.safetensors)"``. Values are numbers,
             ``True``, ``False``, ``None``, or unquoted strings.
 

@@ -114,7 +114,7 @@ class Method:
     """A method of the benchmark: a model with settings, as passed to :class:`mcdenoise.denoiser.Denoiser`.
 
     Args:
-        name: unique, such as ``cascaded_v2`` or ``oidn(quality=fast)``.
+        name: unique, such as ``wild`` or ``oidn(quality=fast)``.
         kind: a trained model, another model, or a baseline (``noisy`` does nothing, ``accumulated`` only accumulates).
         folder: name of its folder in ``images/SCENE``.
         model: name of the model, or ``path/to/file.py:factory``; methods of one model have the same colour in plots.

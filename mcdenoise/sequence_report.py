@@ -16,7 +16,7 @@ class SequenceReport:
     Args:
         model: name of the model with its settings, or path of its weights.
         reading: how the sequence stores its color.
-        picked: the model that was picked, and why; empty if it was named.
+        picked: the model that limits of run time or error have picked, and why; empty without limits.
         frames: report of each frame, by number; run times include waiting for the disk.
         files: the written file of each frame, by number.
         alike: frames that look like the previous one but have no history.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.denoiser import AskedPrecision, Denoiser, suitable_model
+from mcdenoise.denoiser import AskedPrecision, Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.methods import Spelling, parse_method
 from mcdenoise.models import DEFAULT
@@ -30,9 +30,7 @@ class ShotSettings:
     Args:
         model: a name from `mcdenoise models`, optionally with settings, such as "oidn(quality=fast)"; a weights file;
             or your own model, path/to/file.py:factory or package.module:factory. The default is the model that the
-            weights are for; without weights, it depends on the frames: where features have no noise, cascaded_v2 for
-            noisy sequences and oidn_tuned_exact for others, else oidn_tuned; or cascaded_v3 with
-            settings that oidn_tuned does not have.
+            weights are for, or else wild.
         weights: safetensors file of your own weights for that model.
         frames: frames to denoise, such as 0-59,70; all by default.
         device: where the model runs, cpu or cuda.
@@ -165,7 +163,7 @@ class ShotSettings:
     def chosen(
         self, sequence: Sequence, on_step: Callable[[int, int], None] = lambda done, total: None
     ) -> tuple[ShotSettings, str]:
-        """Choose the model, if none is named; return the settings with it, and a description.
+        """Choose the model that meets the limits, if there are any; return the settings with it, and a description.
 
         Args:
             sequence: the frames.
@@ -175,11 +173,7 @@ class ShotSettings:
             InputError: no model meets the limits.
         """
         if not self.is_budgeted:
-            if self.model is not None or self.weights is not None:
-                return self, ""
-            historic = self.alpha_min is not None or not self.anti_lag or self.tolerance is not None
-            model, why = default_model(sequence, cascade=historic)
-            return replace(self, model=model), f"{model}: {why}"
+            return self, ""
         # Imported here because it loads the benchmark, which takes time.
         from mcdenoise.budget import choose_model
 
@@ -196,7 +190,7 @@ class ShotSettings:
 
     @property
     def spelling(self) -> Spelling:
-        """The requested model, or the model that the weights are for, or ``cascaded_v2``.
+        """The requested model, or the model that the weights are for, or the default.
 
         Raises:
             InputError: the model is unknown, or its weights cannot be read.
@@ -229,16 +223,6 @@ class ShotSettings:
             wrap=self.wrap,
             **{name: value for name, value in asked.items() if value is not None},
         )
-
-
-def default_model(sequence: Sequence, *, cascade: bool = False) -> tuple[str, str]:
-    """The name of the model that suits a shot, and the reason in words, see :func:`suitable_model`.
-
-    Args:
-        sequence: the shot; see :meth:`mcdenoise.data.Sequence.first_valid_frame`.
-        cascade: whether a cascade is required.
-    """
-    return suitable_model(sequence.first_valid_frame(), still=len(sequence) == 1, cascade=cascade)
 
 
 def check_threads(threads: int) -> None:

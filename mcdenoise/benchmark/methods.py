@@ -19,7 +19,7 @@ from mcdenoise.models._precision import PRECISIONS, has_network
 from mcdenoise.models._times import Times
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.models._wrapper import parts_of
-from mcdenoise.nn import FusionModule, LogFusion, UNet
+from mcdenoise.nn import FusionModule, UNet
 from mcdenoise.results import KEEP_ALL, Kind, Method
 
 BASELINES = ("noisy", "accumulated")
@@ -185,6 +185,6 @@ def _networks(model: Any) -> Iterator[nn.Module]:
     """The outermost U-Nets and convolutions of a model; the fusion of scales counts as filter."""
     if isinstance(model, UNet | nn.Sequential | nn.Conv2d | nn.ConvTranspose2d):
         yield model
-    elif isinstance(model, nn.Module) and not isinstance(model, FusionModule | LogFusion):
+    elif isinstance(model, nn.Module) and not isinstance(model, FusionModule):
         for child in model.children():
             yield from _networks(child)

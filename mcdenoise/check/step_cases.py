@@ -13,8 +13,8 @@ import torch
 from torch import Generator, Tensor
 
 from mcdenoise.check import _temporal
-from mcdenoise.check.case import Case, Draw, Inputs, Op, between, normal, uniform
-from mcdenoise.ops._steps import history, network
+from mcdenoise.check.case import Case, Draw, Inputs, Op, between
+from mcdenoise.ops._steps import history
 
 # Batch, height and width.
 Size = tuple[int, int, int]
@@ -35,30 +35,16 @@ def _images(
     return drawn
 
 
-def _step(
-    function: Callable[..., Any], arguments: dict[str, Argument], smooth: str, extra: tuple[Case, ...] = (), **more: Any
-) -> Op:
+def _step(function: Callable[..., Any], arguments: dict[str, Argument], smooth: str, **more: Any) -> Op:
     """A step with a case of each size; between accumulation and convolutions frames are in float32 at least."""
-    cases = (
+    cases = tuple(
         Case(name, "ordinary", partial(_drawn, arguments, size), tuple(smooth.split())) for name, size in SIZES.items()
     )
-    return Op(function, (*cases, *extra), half_precision=False, **more)
+    return Op(function, cases, half_precision=False, **more)
 
 
 def _drawn(arguments: dict[str, Argument], size: Size, g: Generator) -> Inputs:
     return {name: draw(size, g) for name, draw in arguments.items()}
-
-
-def _factor(size: Size, g: Generator) -> Tensor:
-    return uniform(g, size[0], 1, 1, 1, low=0.5, high=2.0)
-
-
-def _coarse(size: Size, g: Generator) -> Tensor:
-    return normal(g, size[0], 3, (size[1] + 1) // 2, (size[2] + 1) // 2)
-
-
-def _far_corner(depth: Tensor) -> None:
-    depth[..., 0, -1] = torch.inf
 
 
 def _firefly(color: Tensor) -> None:
@@ -69,23 +55,6 @@ def _bright_corner(root: Tensor) -> None:
     root[..., : root.shape[-2] // 2 + 1, : root.shape[-1] // 2 + 1] = 6
 
 
-_BUFFERS: dict[str, Argument] = {
-    "image": _images(3),
-    "albedo": _images(3, uniform),
-    "normal": _images(3, normal),
-    "depth": _images(1, between(1.0, 20.0), _far_corner),
-    "current": _images(3),
-    "length": _images(1, between(1.1, 4.0)),
-    "exposure": _factor,
-    "scale": lambda size, g: [_factor(size, g), _factor(size, g)],
-}
-_FUSION: dict[str, Argument] = {
-    "fine": _images(3),
-    "coarse": _coarse,
-    "weight": lambda size, g: 0.3 * normal(g, 1, 6, 3, 3),
-    "bias": lambda size, g: normal(g, 1),
-}
-_PARTS = tuple(_FUSION)
 _HISTORY: dict[str, Argument] = {
     "entering": _images(3),
     "previous": _images(3),
@@ -95,15 +64,6 @@ _HISTORY: dict[str, Argument] = {
 }
 
 STEPS: tuple[Op, ...] = (
-    _step(network.buffers_input, _BUFFERS, "image albedo normal current length exposure scale"),
-    # Its weights have no batch axis.
-    _step(
-        network.gated_fusion,
-        _FUSION,
-        "fine coarse weight bias",
-        (Case("logarithms", "ordinary", partial(_drawn, _FUSION, (1, 3, 5)), _PARTS, {"logarithms": True}),),
-        batched=False,
-    ),
     _step(
         history.incoming,
         {"color": _images(3, change=_firefly), "albedo": _images(3, between(0.1, 0.9))},

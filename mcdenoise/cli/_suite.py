@@ -9,11 +9,9 @@ from mcdenoise.benchmark import Settings, choose_methods, run_benchmark
 from mcdenoise.benchmark.tables import remarks
 from mcdenoise.cli._output import progress_bar, say, steps_of, write_json
 from mcdenoise.data.files import write_text
-from mcdenoise.denoiser._choice import EXACT, FILTERED
 from mcdenoise.errors import InputError
 from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
-from mcdenoise.shot import default_model
 from mcdenoise.suite import (
     SHOWN,
     choose_rows,
@@ -21,7 +19,6 @@ from mcdenoise.suite import (
     lines_of,
     markdown,
     open_row,
-    picked_lines,
     render_suite,
     rows_there,
     sample_curves,
@@ -47,7 +44,7 @@ def score_suite(
     if out is None and not render:
         raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
     # Report errors in the choice of methods before hours of rendering.
-    named = with_peers(models or f"{DEFAULT},{EXACT},{FILTERED}")
+    named = with_peers(models or DEFAULT)
     methods = choose_methods(named, precisions=precisions, baselines=("noisy",))
     if out is not None:
         check_packages()
@@ -73,8 +70,6 @@ def score_suite(
         results = run_benchmark(shots, methods, out, settings, on_step=on_step)
     lines, curves = lines_of(results, found), lines_of(results, found, curve=True)
     ours = dict.fromkeys(line.model for line in lines)
-    names = {line.row for line in lines}
-    lines += picked_lines(results, lines, {shot.name: default_model(shot)[0] for shot in shots if shot.name in names})
     text = markdown(lines, curves, *error_against_time(results, found))
     write_text(out / "suite.md", text)
     content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}

@@ -65,8 +65,8 @@ def benchmark(
         models: methods separated by commas: names of `mcdenoise models`, with optional settings such as
             "oidn(quality=fast|high)"; weights files; file.py:factory; "pretrained" for all models with shipped weights;
             "all" for every model, where those without weights are listed as missing; or "none". By default the models
-            with shipped weights, filters, and other denoisers; with --suite, the two between which `mcdenoise denoise`
-            chooses. The noisy input and accumulation alone are always included.
+            with shipped weights, filters, and other denoisers; with --suite, the default of `mcdenoise denoise`. The
+            noisy input and accumulation alone are always included.
         precisions: precisions of the convolutions of trainable models: float32,bfloat16 by default, float32
             with --suite.
         frames: frames of each sequence to denoise, such as 0-59,70; all by default.

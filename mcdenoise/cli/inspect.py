@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mcdenoise.cli._options import Flag, Inputs, Json, Map
-from mcdenoise.cli._output import print_rows, say, warn, write_json
+from mcdenoise.cli._output import print_rows, warn, write_json
 from mcdenoise.data import Sequence
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.errors import printable
@@ -19,7 +19,7 @@ def inspect(
     input_linear: Flag = False,
     json: Json = None,
 ) -> None:
-    """Show from which layers the buffers of a shot would be read, how, and why, and the model, without denoising.
+    """Show from which layers the buffers of a shot would be read, how, and why, without denoising.
 
     Args:
         inputs: a folder; files; or a pattern, as for `mcdenoise denoise`.
@@ -42,8 +42,6 @@ def inspect(
     used = _users(opened)
     for buffer, models in used.items():
         print(f"{buffer}: of use to {', '.join(models) or 'no model of the zoo'}")
-    _, choice = shot.chosen(opened)
-    say(f"`mcdenoise denoise` picks {choice}")
     write_json(
         json,
         {
@@ -54,7 +52,6 @@ def inspect(
             "buffers": sorted(opened.buffers),
             "read": [row._asdict() for row in opened.table],
             "of_use_to": used,
-            "picked": choice,
             "unused": list(opened.unused),
             "warnings": list(opened.warnings),
         },

@@ -28,8 +28,8 @@ _MOTION = {"motion", "position", "previous_position", "view_projection"}
 def models(all: Flag = False, ops: Flag = False, json: Json = None) -> None:
     """List the models to use: paper, required and used buffers, weights, parameters, and operations per pixel.
 
-    These have shipped weights; `mcdenoise denoise` picks one of them if none is named. The column "uses" lists `motion`
-    if a model uses motion buffers, or positions with cameras, whichever a frame has.
+    These have shipped weights; `mcdenoise denoise` takes wild if none is named. The column "uses" lists `motion` if a
+    model uses motion buffers, or positions with cameras, whichever a frame has.
 
     Args:
         all: list every model by kind: also methods of publications to compare with, filters, and other denoisers.

@@ -1,7 +1,6 @@
 """Denoising frame by frame, with a history; and denoising of a single image from arrays to an array."""
 
-from mcdenoise.denoiser._choice import FILTERED, suitable_model
 from mcdenoise.denoiser._denoiser import AskedPrecision, Denoiser
 from mcdenoise.denoiser._single import denoise
 
-__all__ = ["FILTERED", "AskedPrecision", "Denoiser", "denoise", "suitable_model"]
+__all__ = ["AskedPrecision", "Denoiser", "denoise"]

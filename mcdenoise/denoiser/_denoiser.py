@@ -14,7 +14,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
-from mcdenoise.denoiser._choice import suitable_model
 from mcdenoise.denoiser._frames import dtype_of, explained, prepared
 from mcdenoise.denoiser._settings import check_kind, check_settings, usable_device
 from mcdenoise.denoiser._turns import in_turn, started
@@ -25,7 +24,7 @@ from mcdenoise.models import DEFAULT, Model, Output, State, create_model
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
 from mcdenoise.models._layers import REST, alpha_of, completed, opened
-from mcdenoise.models._memory import Division, Frames, check_limits
+from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen, Precision, computing_in, fastest_precision, has_network
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
@@ -39,7 +38,7 @@ from mcdenoise.noise import noise_of
 AskedPrecision = Literal["auto", "float32", "bfloat16"]
 
 # Level of noise up to which bfloat16 makes errors larger: by 41 % at 0.001, 6 % at 0.006, 2 % at 0.02, 1 % at 0.06
-# (oidn_tuned on even surfaces, where they are largest).
+# (a network like that of wild, on even surfaces, where they are largest).
 _ROUNDED = 0.03
 
 
@@ -56,9 +55,8 @@ class Denoiser:
         model: the name of a model in the zoo (its shipped weights are loaded), your own ``path/to/file.py:factory`` or
             ``package.module:factory``, a :class:`mcdenoise.models.Model`, or a module or function whose parameters are
             named like buffers (one with a default value is optional). A module of yours is moved to the device, made
-            channels-last and put into evaluation mode. By default it is the one that the weights are for; without
-            weights, the first frame chooses it, once, as in `mcdenoise denoise` (:func:`suitable_model`), and the
-            report says which and why. Until then the attribute ``model`` is ``None``; see :meth:`pick`.
+            channels-last and put into evaluation mode. By default it is the one that the weights are for, or
+            :data:`mcdenoise.models.DEFAULT`.
         weights: a safetensors file of other weights for a model given by name.
         device: device to run on. Frames may come from any device; images are returned on this one.
         precision: precision of convolutions; everything else stays in float32. ``"bfloat16"`` is about twice as fast on
@@ -92,7 +90,7 @@ class Denoiser:
             is unknown, ``tile`` or ``max_memory`` is invalid, or the model cannot be computed in tiles.
 
     Example:
-        >>> denoiser = Denoiser("cascaded_v2_micro")
+        >>> denoiser = Denoiser("wild_small")
         >>> frame = Frame(color=torch.rand(1, 3, 24, 32), depth=torch.ones(1, 1, 24, 32))
         >>> denoiser(frame).shape
         torch.Size([1, 3, 24, 32])
@@ -126,10 +124,6 @@ class Denoiser:
         if precision not in known:
             raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
         self.keep_all, self.differentiable, self.alpha, self.wrap = keep_all, differentiable, alpha, wrap
-        self._picked = ""
-        self._asked, self._given, self._limits = precision, settings, (tile, max_memory)
-        if model is None and weights is not None:
-            model = model_of(Path(weights))
         self._report, self._times = FrameReport(), Times(self.device)
         # Whether the last frame whose noise is known has enough of it to be computed in bfloat16.
         self._rounds = False
@@ -137,61 +131,32 @@ class Denoiser:
         self.frames_stay = False
         # Unset by a caller that shows what the reports doubt.
         self.warns = True
-        # A Model, or None until the first frame has picked one.
-        self.model: Any = None
         if model is None:
-            check_settings(DEFAULT, settings, of=Denoiser)
-            check_limits(tile, max_memory, self.device)
-            self.precision, self._why_precision = self._chosen()
-        else:
-            self._make(model, weights)
-        self.reset()
-
-    def _make(self, model: str | Model | nn.Module, weights: Path | str | None = None) -> None:
-        """Make the model and what depends on it."""
+            model = DEFAULT if weights is None else model_of(Path(weights))
         name, of_zoo = str(model), isinstance(model, str) and ":" not in model
         if isinstance(model, str):
-            check_settings(model, self._given, of=Denoiser)
-            model = create_model(model, pretrained=weights is None, weights=weights, **self._given)
-        elif self._given or weights is not None:
-            names = ", ".join([*self._given, *(["weights"] if weights else [])])
+            check_settings(model, settings, of=Denoiser)
+            model = create_model(model, pretrained=weights is None, weights=weights, **settings)
+        elif settings or weights is not None:
+            names = ", ".join([*settings, *(["weights"] if weights else [])])
             raise InputError(f"{names}: expected a model's name, found a model")
         if isinstance(model, nn.Module):
             # Channels-last convolutions are about 1.5 times faster on a CPU.
             model.to(self.device, memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
         self.model = as_model(model)
         self._name = name if of_zoo else name_of(self.model)
-        self.precision, self._why_precision = self._chosen(of_zoo=of_zoo)
-        self._tiles = Division(self.model, *self._limits, self.device)
+        self.precision, self._why_precision = self._chosen(precision, of_zoo=of_zoo)
+        self._tiles = Division(self.model, tile, max_memory, self.device)
+        self.reset()
 
-    @in_turn
-    def pick(self, frame: Frame | None) -> None:
-        """Choose the model by a frame, if none was named or chosen before; otherwise the first frame does so.
-
-        Args:
-            frame: any of the shot, or ``None`` for features that are known to be filtered, see :func:`suitable_model`.
-
-        Raises:
-            InputError: the chosen model cannot be made with the settings, or memory is insufficient.
-        """
-        if self.model is None:
-            with torch.no_grad():
-                name, why = suitable_model(frame, still=self._frames == 1, cascade=bool(self._given))
-            # Weights can be trained later, also if the caller infers only now.
-            with self._times.of("pick"), torch.inference_mode(False), torch.enable_grad():
-                self._make(name)
-            self._picked = f"{name}: {why}"
-            self._plan()
-
-    def _chosen(self, *, of_zoo: bool = True) -> Chosen:
-        if self._asked != "auto":
-            return Chosen(self._asked, "asked for")
+    def _chosen(self, asked: AskedPrecision, *, of_zoo: bool) -> Chosen:
+        if asked != "auto":
+            return Chosen(asked, "asked for")
         if self.differentiable:
             return Chosen("float32", "derivatives are wanted")
         if not of_zoo:
             return Chosen("float32", "what bfloat16 rounds in a model of your own is for you to judge")
-        # Every model that is picked has a network.
-        if self.model is None or has_network(self.model):
+        if has_network(self.model):
             return fastest_precision(self.device)
         return Chosen("float32", "nothing is learnt")
 
@@ -225,15 +190,9 @@ class Denoiser:
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
         self._count, self._frames, self._buffers = 0, frames, buffers
-        self._size, self._expected_layers = size, layers
-        self._plan()
-
-    def _plan(self) -> None:
-        """Foresee the memory of the shot, as far as it is known."""
-        size, buffers, layers = self._size, self._buffers, self._expected_layers
         # A single frame has no next one to read.
-        self.has_room_ahead = size is not None and self._frames != 1 and self.model is not None
-        if buffers is not None and size is not None and self.model is not None:
+        self.has_room_ahead = size is not None and frames != 1
+        if buffers is not None and size is not None:
             streaming = self.has_history(buffers)
             # One more for the remainder.
             carried = layers + (layers > 0) + (self.alpha and "alpha" in buffers)
@@ -321,9 +280,6 @@ class Denoiser:
                 whole = frame.to(self.device).to(dtype).replace(hints=hints)
                 whole = wrapped(whole) if self.wrap else whole
                 frame, void = prepared(whole, report, self._doubt)
-                if self.model is None:
-                    self.pick(frame)
-                report.model = self._picked
                 self._check_layers(frame)
                 report.missing = absent_buffers(self.model, frame)
                 precision, report.tiles = self._planned(frame, report)

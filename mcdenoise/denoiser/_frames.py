@@ -42,9 +42,9 @@ def prepared(frame: Frame, report: FrameReport, doubt: Callable[[str], None]) ->
     return closed(frame.with_depth(), report.ask), void
 
 
-def dtype_of(frame: Frame, model: Model | None, *, differentiable: bool) -> torch.dtype:
+def dtype_of(frame: Frame, model: Model, *, differentiable: bool) -> torch.dtype:
     """The dtype that a frame is computed in: float64 if it and all weights are, for derivatives."""
-    exact = model is not None and differentiable and frame.color.dtype == torch.float64
+    exact = differentiable and frame.color.dtype == torch.float64
     return torch.float64 if exact and _dtypes(model) <= {torch.float64} else torch.float32
 
 
@@ -64,6 +64,6 @@ def explained(model: Model, dtype: torch.dtype) -> Iterator[None]:
         ) from error
 
 
-def _dtypes(model: Model | None) -> set[torch.dtype]:
+def _dtypes(model: Model) -> set[torch.dtype]:
     """Those of a model's weights."""
     return {each.dtype for each in model.parameters()} if isinstance(model, nn.Module) else set()

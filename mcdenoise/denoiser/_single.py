@@ -62,7 +62,7 @@ def denoise(
 
     Example:
         >>> noisy, albedo = np.random.rand(24, 32, 3), np.full((24, 32, 3), 0.5)
-        >>> clean = denoise(noisy, albedo=albedo, model="cascaded_v2_micro")
+        >>> clean = denoise(noisy, albedo=albedo, model="wild_small")
         >>> clean.shape, clean.dtype
         ((24, 32, 3), dtype('float32'))
     """

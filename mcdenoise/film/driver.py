@@ -53,7 +53,7 @@ class ShotResult:
     """The state of a shot.
 
     Args:
-        shot: the shot; with the model that was picked, after the scan.
+        shot: the shot; with the model that limits have picked, after the scan.
         found: result of the scan; ``None`` before it.
         made: number of frames that were denoised in this run.
         failed: for each failed frame, by number, the reason.

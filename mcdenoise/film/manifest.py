@@ -34,7 +34,7 @@ class Shot:
         name: of its folder in the output.
         inputs: folders, files or patterns, as absolute paths.
         settings: how it is denoised, with absolute paths.
-        picked: the model that was picked, and why; empty if it was named, and before the scan.
+        picked: the model that limits of run time or error have picked, and why; empty without them or before the scan.
     """
 
     name: str

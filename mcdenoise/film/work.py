@@ -99,7 +99,7 @@ class Found:
     """The result of :func:`scan`.
 
     Args:
-        shot: the shot, with the model that was picked, if none is named.
+        shot: the shot, with the model that limits have picked, if there are any.
         numbers: numbers of all frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
         overlap: number of frames that the history needs.

@@ -64,8 +64,7 @@ class MitsubaDenoiser:
         normals: whether calls pass shading normals; unlike with OptiX, these do not require an albedo.
         temporal: whether calls are the frames of a shot, with flow; otherwise each frame is a still.
         denoise_alpha: whether alpha, the second or fourth channel, is denoised; otherwise it is returned unchanged.
-        model: as for :class:`mcdenoise.Denoiser`; by default ``"oidn_tuned"``, for features through a pixel
-            filter, or ``"cascaded_v3"`` for settings of the history, or the one that the weights are for.
+        model: as for :class:`mcdenoise.Denoiser`.
         device: device of torch; by default a GPU for the CUDA variants if torch has one, otherwise the CPU.
         precision: as for :class:`mcdenoise.Denoiser`.
         settings: its other arguments (``weights``, ``tile``, ``max_memory``), and settings of the model.
@@ -113,7 +112,6 @@ class MitsubaDenoiser:
             cuda = str(self._mi.variant()).startswith("cuda") and torch.cuda.is_available()
             device = "cuda" if cuda else "cpu"
         self.denoiser = Denoiser(model, device=device, precision=precision, **settings)
-        self.denoiser.pick(None)
         if not isinstance(model, nn.Module) and isinstance(self.denoiser.model, nn.Module):
             self.denoiser.model.requires_grad_(False)
 

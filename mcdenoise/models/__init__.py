@@ -8,7 +8,6 @@ from mcdenoise.models._weights import create_model, describe_weights, load_weigh
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
-from mcdenoise.models.coarse_to_fine import CoarseToFine
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.recurrent import Recurrent
@@ -16,13 +15,12 @@ from mcdenoise.models.restored import Restored
 from mcdenoise.models.skipping import Skipping
 from mcdenoise.models.tiled import Tiled
 
-DEFAULT = "cascaded_v2"
+DEFAULT = "wild"
 
 __all__ = [
     "DEFAULT",
     "Accumulated",
     "Chain",
-    "CoarseToFine",
     "Demodulated",
     "Exposed",
     "Model",

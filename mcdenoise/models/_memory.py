@@ -68,7 +68,11 @@ class Division:
 
     def __init__(self, model: Model, side: int | None, max_memory: float | None, device: torch.device) -> None:
         self._tiled = [tiled for tiled in parts_of(model, Tiled) if tiled.halo is not None]
-        self._memory = check_limits(side, max_memory, device)
+        if side is not None:
+            check_side(side)
+            if max_memory is not None:
+                raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
+        self._memory = Memory(None if max_memory is None else max_memory * GB, device)
         if not self._tiled and (side, max_memory) != (None, None):
             raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
         self._side = side
@@ -246,19 +250,6 @@ def describe(size: tuple[int, int], side: int) -> str:
     tiles = Region(0, 0, *size).split(side)
     columns = sum(tile.top == 0 for tile in tiles)
     return f"{columns} x {len(tiles) // columns} tiles of up to {tiles[0].right}x{tiles[0].bottom} pixels"
-
-
-def check_limits(side: int | None, max_memory: float | None, device: torch.device) -> Memory:
-    """The memory that :class:`Division` may take.
-
-    Raises:
-        InputError: side or memory are no such number, or both are given.
-    """
-    if side is not None:
-        check_side(side)
-        if max_memory is not None:
-            raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
-    return Memory(None if max_memory is None else max_memory * GB, device)
 
 
 def check_side(side: int) -> None:

@@ -51,7 +51,6 @@ class FrameReport:
         tiles: how the image was divided into tiles, and why.
         history: fraction of the pixels that have a history; ``None`` if no history was looked up.
         precision: the reason for the precision of the convolutions.
-        model: the model that the first frame has picked, and why; empty if it was named.
         repairs: what was NaN, infinite, negative or above 1e16 in the noisy color.
         repeats: the advice for frames that repeat the noise of the frame before; empty for others.
         missing: buffers that would improve the result and that the frame lacks.
@@ -64,7 +63,6 @@ class FrameReport:
     tiles: str = ""
     history: float | None = None
     precision: str = ""
-    model: str = ""
     repairs: Repairs = field(default_factory=Repairs)
     repeats: str = ""
     missing: list[str] = field(default_factory=list)
@@ -98,7 +96,6 @@ class FrameReport:
             "negative light": f"{self.repairs.negative:.2%}" if self.repairs.negative else "",
             "tiles": self.tiles,
             "precision": self.precision,
-            "model": self.model,
         }
         return "\n".join(f"{name}: {text}" for name, text in lines.items() if text)
 

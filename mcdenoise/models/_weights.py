@@ -240,7 +240,7 @@ def start_with(model: Model, name: str, **settings: Any) -> str:
     """Copy the weights of another model to the layers of the same names.
 
     A layer may have more channels than the other model's: its first channels then take the weights, and the rest start
-    with zeros, so that they have no effect at first. Parts of the model with a method ``keep_start()`` are told.
+    with zeros, so that they have no effect at first.
 
     Args:
         model: changed in place; its other layers keep their weights.
@@ -269,9 +269,6 @@ def start_with(model: Model, name: str, **settings: Any) -> str:
             raise InputError(f"start_from: expected layer '{key}' of '{name}', {tuple(tensor.shape)}, found {found}")
         with torch.no_grad():
             own[key].zero_()[tuple(map(slice, tensor.shape))].copy_(tensor)
-    for part in model.modules() if isinstance(model, nn.Module) else ():
-        if callable(keep := getattr(part, "keep_start", None)):
-            keep()
     shipped = find_weights(name)
     return _digest(tensors) if shipped is None else str(describe_weights(shipped)["sha256"])
 

@@ -42,11 +42,10 @@ from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, Stat
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.nn.inputs import features_of
+from mcdenoise.nn.inputs import features_of, normalized_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
-from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import affinity_filter
-from mcdenoise.ops._steps.network import normalized_depth
 
 FEATURES, FILTERS, KERNEL_SIZE, LEVELS = 8, 3, 7, 4
 _OF_FILTER = FEATURES + 2  # a and c
@@ -74,7 +73,7 @@ class Anf(Network):
             nn.LeakyReLU(),
         )
         self.unet = UNet(2 * width, [width] * LEVELS, scales=1)
-        self.head = Head(self.unet, 0, FILTERS * _OF_FILTER + 2)
+        self.head = nn.Conv2d(width, FILTERS * _OF_FILTER + 2, 3, padding=1)
         with torch.no_grad():
             # Bandwidths start at about 1, because a square has no slope at 0.
             self.head.bias[FEATURES::_OF_FILTER] = 1.0  # type: ignore[index]
@@ -90,7 +89,7 @@ class Anf(Network):
         result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
 
         unet_input = torch.cat([embedded, embedded_before], 1)
-        predicted = self.head(self.unet(unet_input)[0], frame.size).to(light.dtype)
+        predicted = self.head(self.unet(unet_input)[0]).to(light.dtype)
         *filters, last = predicted.split([_OF_FILTER] * FILTERS + [2], 1)
         stays = torch.sigmoid(last[:, :1]) * known
         mean = torch.lerp(light, mean_before, stays)

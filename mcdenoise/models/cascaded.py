@@ -32,7 +32,7 @@ from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import FusionModule
-from mcdenoise.nn.unet import Head, UNet
+from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 
 Normalize = Literal["softmax", "none"]
@@ -46,7 +46,7 @@ class _Scales(Network):
     def __init__(self, width: int, channels: int, radius: int) -> None:
         super().__init__()
         self.unet = UNet(10, [width] * LEVELS)  # color 3, albedo 3, normal 3, depth 1
-        self.heads = nn.ModuleList(Head(self.unet, scale, channels) for scale in range(self.unet.scales))
+        self.heads = nn.ModuleList(nn.Conv2d(width, channels, 3, padding=1) for _ in range(self.unet.scales))
         self.fusions: Sequence[FusionModule] = nn.ModuleList(  # type: ignore[assignment]
             FusionModule() for _ in range(self.unet.scales - 1)
         )
@@ -85,7 +85,7 @@ class PixelNetwork(_Scales):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         levels = self.unet(self.input_of(frame, frame.color))
-        images = [head(level, level.shape[-2:]) for head, level in zip(self.heads, levels, strict=True)]
+        images = [head(level) for head, level in zip(self.heads, levels, strict=True)]
         return Output(self.fuse([image.to(frame.color.dtype) for image in images])), None  #                    Eq. 1
 
 
@@ -116,7 +116,7 @@ class KernelNetwork(_Scales):
         for scale, (head, level) in enumerate(zip(self.heads, levels, strict=True)):
             if scale:
                 x, normal, depth = downsample(x), downsample(normal), downsample(depth)
-            predicted = head(level, x.shape[-2:])  #                                                            Eq. 3
+            predicted = head(level)  #                                                                          Eq. 3
             w, f = predicted[:, : self.taps], F.softplus(predicted[:, self.taps :].to(x.dtype))
             guides = [normal, depth] if self.bilateral else []
             f1, f2, f3 = f.split(1, 1) if self.bilateral else (None, None, None)

@@ -21,10 +21,9 @@ from mcdenoise.models._void import ISLAND
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
-from mcdenoise.nn.inputs import auto_exposure, scale_of_depth
+from mcdenoise.nn.inputs import auto_exposure, normalized_depth, scale_of_depth
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._steps.network import normalized_depth
 
 # Depths in [0, 1] differ by much less than albedos and normals do: without a scale of its own, depth hardly guides.
 DEPTH_SCALE = 10.0

@@ -30,7 +30,7 @@ class Noisy(nn.Module):
 
 @register_model("accumulated", kind="filter")
 def accumulated(*, alpha_min: float = 0.1, anti_lag: bool = True) -> Model:
-    """Temporal accumulation without a spatial filter, the first step of the family ``cascaded_v2``.
+    """Temporal accumulation without a spatial filter, the first step of ``wild``.
 
     Args:
         alpha_min: smallest weight of the current frame, see :class:`mcdenoise.models.Accumulated`.

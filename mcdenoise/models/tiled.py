@@ -20,8 +20,8 @@ TILE = 32
 # A method on more than this fraction of the image costs as much as on all of it.
 _WORTHWHILE = 0.9
 # Width of the mirror image around an image, at least. Convolutions take what is beyond their input as black: without a
-# border the corners of a constant image are off by 60 % (oidn_tuned), and pixels at the edge have 1.3 times the error.
-# Twice the width gains nothing more.
+# border the corners of a constant image are off by 60 % (a network like that of wild), and pixels at the edge have 1.3
+# times the error. Twice the width gains nothing more.
 MIRRORED = 16
 
 
@@ -38,14 +38,13 @@ class Tiled(Wrapper):
         inner: a method without a state. One that depends on the whole image (``needs.reach`` is ``None``) is never
             divided.
         side: longest side of a tile in pixels, a multiple of 32; ``None`` for no limit.
-        margin: number of pixels around a tile that have to be right, too.
         border: width of the mirror image around the image, rounded up to the method's stride; a method with a smaller
             reach goes without.
     """
 
-    def __init__(self, inner: Model, side: int | None = None, margin: int = 0, border: int = MIRRORED) -> None:
+    def __init__(self, inner: Model, side: int | None = None, border: int = MIRRORED) -> None:
         super().__init__(inner)
-        self.side, self.margin, self.border = side, margin, border
+        self.side, self.border = side, border
 
     @property
     def halo(self) -> int | None:
@@ -53,7 +52,7 @@ class Tiled(Wrapper):
         needs = self.inner.needs
         if needs.reach is None or TILE % needs.stride:
             return None
-        return -(-(needs.reach + self.margin) // needs.stride) * needs.stride
+        return -(-needs.reach // needs.stride) * needs.stride
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
@@ -65,13 +64,13 @@ class Tiled(Wrapper):
         whole: Output | None = None
         halo = self.halo or 0
         for part in parts:
-            around, kept = part.grown(halo, frame.size), part.grown(self.margin, frame.size)
+            around = part.grown(halo, frame.size)
             output, after = self._within(around, frame)
             if after is not None:
                 raise TypeError("inner: expected a method without a state to compute in tiles, found one with a state")
             whole = _known(frame, output) if whole is None else whole._replace(notes=output.notes)
             for result, image in zip(_images(whole), _images(output), strict=True):
-                kept.of(result).copy_(kept.within(around).of(image))
+                part.of(result).copy_(part.within(around).of(image))
         computed = sum(part.pixels for part in parts) / (frame.size[0] * frame.size[1])
         note = Note("network", f"on {computed:.0%} of the pixels", 1 - computed)
         return (_known(frame, Output(frame.color)) if whole is None else whole).noted(note), None

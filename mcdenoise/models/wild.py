@@ -3,15 +3,15 @@
 The layers are those of Open Image Denoise, and can start with the weights that it was published with. In the place of
 the library's noisy image they see a mean of the frame and of the accumulated radiance, which holds the samples of all
 frames that showed the same surface. A small network weighs both: the history has less noise, but is late or blurred
-where light changes and where pixels move by fractions. Beside it the layers see the frame, how long the history is, and
-on request the previous result. Each pixel of the result is a weighted mean of the network's own image and of these, so
-the error falls with every sample.
+where light changes and where pixels move by fractions. Beside it the layers see the frame, the accumulated radiance,
+and how long the history is. Each pixel of the result is a weighted mean of the network's own image and of these, so the
+error falls with every sample.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Literal, TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -24,20 +24,19 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT, Recurrent
-from mcdenoise.models.skipping import Skipping
+from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.ops._steps.transfer import compress
-from mcdenoise.ops._steps.tuned import tuned_choice, tuned_input
+from mcdenoise.ops._steps.wild import wild_choice, wild_input
 from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops.lag import THRESHOLD
 
-History: TypeAlias = Literal["accumulated", "previous", "both"]
-
-# The mean of frame and history, albedo, normal as the library sees them; the frame, the previous result; the history.
+# The mean of frame and history, albedo, normal as the library sees them; the frame, the accumulated radiance; the part
+# of the history.
 _CHANNELS = 9 + 3 + 3 + 1
-# Initial logits of the network's image, of the frame, of the previous result, and of the mean.
+# Initial logits of the network's image, of the frame, of the accumulated radiance, and of the mean.
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -12.0  # that of the network's image, while its weights are random
 _PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
@@ -102,29 +101,27 @@ class Trust(nn.Module):
 class WildNetwork(nn.Module):
     """The network: ``expand(sum_i w_i x_i)`` over four images ``x_i`` on the library's scale of radiance.
 
-    They are the image that the network predicts, the frame, the previous result (where it is not seen, the accumulated
-    radiance), and the mean of the frame and the accumulated radiance, see :class:`Trust`:
-    ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where ``h`` is the
-    part of the history in the accumulated radiance, ``1 - 1 / length``, or the weight of the previous result if none is
-    accumulated. So without a history only the network's image and the radiance have a weight. Radiance is taken and
-    returned without its albedo, as :class:`mcdenoise.models.Demodulated` divides it out; the network works on the
-    products. A missing albedo counts as one, a missing normal as zero.
+    They are the image that the network predicts, the frame, the accumulated radiance, and the mean of the last two, see
+    :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where
+    ``h`` is the part of the history in the accumulated radiance, ``1 - 1 / length``. So without a history only the
+    network's image and the radiance have a weight. Radiance is taken and returned without its albedo, as
+    :class:`mcdenoise.models.Demodulated` divides it out; the network works on the products. A missing albedo counts as
+    one, a missing normal as zero.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
         stem: side of the blocks of pixels that the layers see as one, 1 or more. The layers see the mean of a block, as
             if it was a pixel of a smaller image, and how its pixels differ from the last one.
-        previous: whether the previous result is seen, of :class:`mcdenoise.models.Recurrent`.
 
     Raises:
         InputError: ``stem`` is below 1.
     """
 
-    def __init__(self, size: Size = "base", stem: int = 1, *, previous: bool = False) -> None:
+    def __init__(self, size: Size = "base", stem: int = 1) -> None:
         super().__init__()
         if stem < 1:
             raise InputError(f"stem: expected at least 1, found {stem}")
-        self.stem, self.previous, blocks = stem, previous, stem * stem
+        self.stem, blocks = stem, stem * stem
         self.unet = OidnUNet(_CHANNELS * blocks, size, out_channels=(3 + len(_LOGITS)) * blocks)
         self.trust = Trust()
         # With random weights, the result first is the radiance that was given; other weights come with their own.
@@ -134,9 +131,9 @@ class WildNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.weight[3:].div_(_PACE)
             last.bias.zero_()[3].fill_(_LITTLE / _PACE)
-        uses, unet = {"current", "length", "albedo", "normal", *((PREVIOUS, PREVIOUS_WEIGHT) * previous)}, self.unet
+        uses, unet = frozenset({"current", "length", "albedo", "normal"}), self.unet
         reach = stem * unet.reach + Trust.reach
-        self.needs = Needs(uses=frozenset(uses), reach=reach, stride=stem * unet.multiple, live=unet.live)
+        self.needs = Needs(uses=uses, reach=reach, stride=stem * unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
@@ -146,21 +143,17 @@ class WildNetwork(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         color, albedo = frame.color, frame.albedo
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
-        alone = color if frame.current is None else frame.current
-        before, part = color, torch.zeros_like(color[:, :1])
-        if self.previous and PREVIOUS in frame.extra:
-            # Where there is none, the accumulated radiance is as good.
-            part = frame.extra[PREVIOUS_WEIGHT]
-            before = torch.lerp(color, frame.extra[PREVIOUS], part)
-        part = (part if frame.length is None else 1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
-        color, alone, before = (_lit(frame, image.to(color.dtype)) for image in (color, alone, before))
+        alone = color if frame.current is None else frame.current.to(color.dtype)
+        history, alone = _lit(frame, color), _lit(frame, alone)
+        mean, part = history, torch.zeros_like(color[:, :1])
         if frame.length is not None:
-            shown = (compress(image * exposure) for image in (alone, color))
-            color = torch.lerp(alone, color, self.trust(*shown, part, albedo, frame.normal))
-        seen, images = tuned_input(color, alone, before, albedo, frame.normal, part, exposure, self.needs.stride)
+            part = (1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
+            shown = (compress(image * exposure) for image in (alone, history))
+            mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
+        seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
         image, logits = corner(self._predicted(seen), *frame.size).split([3, len(_LOGITS)], 1)
         predicted = torch.cat([image, _PACE * logits], 1)
-        image = tuned_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
+        image = wild_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image if albedo is None else demodulate(image, albedo)), None
 
     def _predicted(self, seen: Tensor) -> Tensor:
@@ -181,23 +174,29 @@ def _lit(frame: Frame, image: Tensor) -> Tensor:
     return image if frame.albedo is None else remodulate(image, frame.albedo)
 
 
-def _wild(size: Size = "base", stem: int = 1, *, history: History = "accumulated", alpha_min: float = 0.03) -> Model:
+def _wild(
+    size: Size = "base",
+    stem: int = 1,
+    *,
+    alpha_min: float = 0.03,
+    anti_lag: bool = True,
+    tolerance: float = TOLERANCE,
+) -> Model:
     """The network behind its history.
 
     Args:
         size: see :class:`WildNetwork`.
         stem: see :class:`WildNetwork`.
-        history: what the network sees of earlier frames: the accumulated radiance, the previous result, or both.
         alpha_min: smallest weight of a frame in the accumulated radiance, see :class:`mcdenoise.models.Accumulated`.
+        anti_lag: whether the history is shortened where the light has changed, see :func:`mcdenoise.ops.history_lag`.
+        tolerance: see :class:`mcdenoise.models.Skipping`.
 
     Raises:
         InputError: a setting is out of its range.
     """
-    if history not in ("accumulated", "previous", "both"):
-        raise InputError(f"history: expected accumulated, previous or both, found '{history}'")
-    model: Model = Tiled(WildNetwork(size, stem, previous=history != "accumulated"))
-    model = Skipping(model, alpha_min=alpha_min) if history == "accumulated" else Recurrent(model)
-    return Demodulated(model if history == "previous" else Accumulated(model, alpha_min=alpha_min))
+    model = Skipping(Tiled(WildNetwork(size, stem)), tolerance, alpha_min)
+    threshold = THRESHOLD if anti_lag else math.inf
+    return Demodulated(Accumulated(model, alpha_min=alpha_min, lag_threshold=threshold))
 
 
 register_family(

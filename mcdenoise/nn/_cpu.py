@@ -7,7 +7,7 @@ is requested and nothing is being compiled.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, cast
 
@@ -17,12 +17,6 @@ from torch import Tensor, nn
 
 from mcdenoise.ops._autograd import Function
 from mcdenoise.ops._window import computing_dtype
-
-
-def layout_of(x: Tensor) -> torch.memory_format:
-    """The memory format of a tensor, for tensors to be concatenated with it: torch copies mixed formats one by one."""
-    channels_last = x.is_contiguous(memory_format=torch.channels_last)
-    return torch.channels_last if channels_last else torch.contiguous_format
 
 
 class ConvBlock(nn.Sequential):
@@ -85,7 +79,7 @@ def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
     dtype = computing_dtype(x)
     if not _has_fused_convolution(dtype):
         return F.relu_(layer(x))
-    return _convolved(x, layer.weight, layer.bias, dtype, "relu", stride=layer.stride)
+    return _convolved(x, layer.weight, layer.bias, dtype, "relu")
 
 
 def _convolved(
@@ -95,12 +89,11 @@ def _convolved(
     dtype: torch.dtype,
     then: str | None = None,
     *,
-    stride: Sequence[int] = (1, 1),
     onto: Tensor | None = None,
 ) -> Tensor:
     """A convolution with a border of one pixel, added to ``onto``, which is overwritten; ``then`` a function of it."""
     x, weight, bias = x.to(dtype), weight.to(dtype), None if bias is None else bias.to(dtype)
-    shape = [1, 1], stride, [1, 1], 1  # padding, stride, dilation, groups
+    shape = [1, 1], [1, 1], [1, 1], 1  # padding, stride, dilation, groups
     if onto is None:
         onto = torch.ops.mkldnn._convolution_pointwise(x, weight, bias, *shape, then or "none", [], "")
     else:

@@ -1,4 +1,4 @@
-"""Fusion modules: learnt weights for replacing the low frequencies of a fine image by a coarse image."""
+"""The fusion module: learnt weights for replacing the low frequencies of a fine image by a coarse image."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.ops import laplacian_fusion, upsample
-from mcdenoise.ops._steps.network import gated_fusion
 
 
-class _Fusion(nn.Module):
-    """Predicts the blending weight of two scales: one 3x3 convolution of both, and a sigmoid."""
+class FusionModule(nn.Module):
+    """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
+
+    ``alpha = sigmoid(conv3x3([i_f, U i_c]))``, ``o = i_f - alpha U D i_f + alpha U i_c``. The paper names the module
+    and its inputs but not its layers: here it is one convolution.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -20,8 +23,8 @@ class _Fusion(nn.Module):
         """The blending weight ``(B, 1, H, W)`` in (0, 1).
 
         Args:
-            fine: ``(B, 3, H, W)`` in the unit of the module.
-            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` in the same unit.
+            fine: ``(B, 3, H, W)`` i_f, radiance.
+            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` i_c, radiance.
         """
         both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
         return torch.sigmoid(self.conv(both))
@@ -37,14 +40,6 @@ class _Fusion(nn.Module):
         """
         return torch.lerp(fine, upsample(coarse, (fine.shape[-2], fine.shape[-1])), weight.to(fine.dtype))
 
-
-class FusionModule(_Fusion):
-    """FM of the paper's Fig. 2: predicts the blending weight of Eq. 2 from both images, and blends.
-
-    ``alpha = sigmoid(conv3x3([i_f, U i_c]))``, ``o = i_f - alpha U D i_f + alpha U i_c``. The paper names the module
-    and its inputs but not its layers: here it is one convolution.
-    """
-
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """Fuse two scales.
 
@@ -53,34 +48,3 @@ class FusionModule(_Fusion):
             coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` i_c, radiance.
         """
         return laplacian_fusion(fine, coarse, self.weight(fine, coarse))
-
-
-class LogFusion(_Fusion):
-    """A :class:`FusionModule` for logarithms of radiance.
-
-    In linear radiance, exchanging the low frequencies of a lamp between scales would make the pixels beside it far
-    below zero.
-    """
-
-    def forward(
-        self,
-        fine: Tensor,
-        coarse: Tensor,
-        residual: Tensor | None = None,
-        maximum: Tensor | None = None,
-        logarithms: bool = False,
-    ) -> Tensor:
-        """Fuse two scales.
-
-        Args:
-            fine: ``(B, 3, H, W)`` logarithms of radiance.
-            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` logarithms of radiance.
-            residual: ``(B, 3, H, W)`` to add to the fine image; none by default.
-            maximum: ``(B, 1, 1, 1)`` largest logarithm of the result, which is then converted to radiance.
-            logarithms: whether the fine image is radiance, whose logarithm is to be taken.
-
-        Returns:
-            ``(B, 3, H, W)`` logarithms of radiance, or radiance.
-        """
-        weight, bias = self.conv.parameters()
-        return gated_fusion(fine, coarse, weight, bias, residual=residual, maximum=maximum, logarithms=logarithms)

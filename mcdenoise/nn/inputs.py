@@ -7,9 +7,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.ops._steps.network import buffers_input, depth_scale, normalized_depth
+from mcdenoise.ops._window import accumulator_dtype
 
-FEATURES = 11  # albedo 3, normal 3, depth 1, color of the current frame 3, one over the history length 1
+# The least number that a depth counts as, and how many near depths away the scene ends.
+_SHORTEST, _FARTHEST = 1e-30, 1e4
 
 
 def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
@@ -48,6 +49,39 @@ def normalize_depth(depth: Tensor) -> Tensor:
     return normalized_depth(depth, *depth_scale(depth))
 
 
+def depth_scale(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """A near depth as the unit of depths, and the typical depth in that unit: the geometric mean of all hits.
+
+    The near depth is ``1 / mean(1 / sqrt(d))^2``, which far depths hardly change. Depths 10,000 times as large are no
+    part of the scene, but a sky to which the renderer gave a large finite depth (Blender 1e10, others 1e30), and do not
+    count: their logarithm would hide all differences of near depths.
+
+    Args:
+        depth: ``(B, 1, H, W)`` distance, any unit, ``inf`` where nothing was hit.
+
+    Returns:
+        ``(B, 1, 1, 1)`` each, at least float32; 1 where there is nothing to count. Depths below 1e-30, such as zeros,
+        tell nothing of the near depth, and none counts as less than 1e-30 of it. The near depth is a mere unit and has
+        no derivative.
+    """
+    depth = depth.to(accumulator_dtype(depth.dtype))
+    known = depth.detach()
+    known = torch.where((known >= _SHORTEST) & (known < torch.inf), known, torch.inf)
+    root = known.rsqrt().sum((1, 2, 3), keepdim=True) / (known < torch.inf).sum((1, 2, 3), keepdim=True).clamp_min(1)
+    near = torch.where(root > 0, 1 / torch.where(root > 0, root, 1).square(), 1)
+    in_units = (depth / near).clamp_min(_SHORTEST)
+    counts = in_units <= _FARTHEST
+    total = torch.log(torch.where(counts, in_units, 1)).sum((1, 2, 3), keepdim=True)
+    return near, torch.exp(total / counts.sum((1, 2, 3), keepdim=True).clamp_min(1))
+
+
+def normalized_depth(depth: Tensor, near: Tensor, typical: Tensor) -> Tensor:
+    """``d / (d + typical d)`` with :func:`depth_scale`, and 1 where nothing was hit."""
+    hit = torch.isfinite(depth)
+    in_units = (torch.where(hit, depth, 1).to(near.dtype) / near).clamp(_SHORTEST, 1 / _SHORTEST)
+    return torch.where(hit, in_units / (in_units + typical), 1).to(depth.dtype)
+
+
 def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     """Albedo, normal and depth of a frame; a missing one is a constant image, which guides nothing."""
     color = frame.color
@@ -57,7 +91,7 @@ def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
-    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``, see :func:`mcdenoise.ops._steps.network.depth_scale`.
+    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``, see :func:`depth_scale`.
 
     Returns:
         An empty dictionary if the frame has the value already, or has no depth.
@@ -81,24 +115,6 @@ def image_statistics(frame: Frame) -> dict[str, Tensor]:
     if "depth_scale" not in found:
         found["depth_scale"] = torch.cat(depth_scale(frame.color.new_ones(frame.color.shape[0], 1, 1, 1)), 1)
     return found
-
-
-def input_of(frame: Frame, image: Tensor, *, logarithms: bool = True) -> Tensor:
-    """A network's input: the logarithm of an image, and the features of a frame.
-
-    Args:
-        frame: with the statistics of :func:`image_statistics`.
-        image: ``(B, 3, H, W)`` exposed radiance, or its logarithm.
-        logarithms: whether ``image`` is radiance, whose logarithm is to be taken.
-
-    Returns:
-        ``(B, 14, H, W)``: ``log1p(image)``; albedo, normal and depth in [0, 1]; ``log1p`` of the exposed radiance of
-        the current frame; and one over the history length.
-    """
-    current = frame.color if frame.current is None else frame.current
-    exposure, (near, typical) = frame.statistics["exposure"], frame.statistics["depth_scale"].split(1, 1)
-    features = (*features_of(frame), current, frame.length, exposure, (near, typical))
-    return buffers_input(image, *features, logarithms=logarithms)
 
 
 def guides_of(frame: Frame) -> list[Tensor]:

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Literal, get_args
 
@@ -74,20 +74,6 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
         yield
     finally:
         _used.reset(token)
-
-
-def one_backend(image: Tensor) -> AbstractContextManager[None]:
-    """Choose the backend of all ops within the context by the size of this image, not by that of their arguments.
-
-    A part of an image, or a coarser scale of it, must not be computed otherwise than the whole.
-
-    Args:
-        image: ``(B, C, H, W)``.
-    """
-    # The compiler, which asks for no backend, traces no context variable.
-    if torch.compiler.is_compiling() or _used.get() is not None:
-        return nullcontext()
-    return use(_fastest([image]), strict=False)
 
 
 def _fastest(images: Sequence[Tensor]) -> Backend:

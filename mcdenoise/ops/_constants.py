@@ -36,9 +36,6 @@ STILL = 0.05
 # light is lost to that.
 EVEN, BRIGHTER, LIGHT_WINDOW = 0.03, 1.2, 9
 
-# The least number that a depth counts as.
-SHORTEST = 1e-30
-
 # The epsilon of SVGF's Eq. 3, which the paper leaves open, as a fraction of the depth: the precision of depths in half
 # floats. The others keep quotients and their derivatives finite, where `exp` of them is zero in any precision.
 DEPTH_EPSILON, LEAST_DEPTH, HIGHEST_QUOTIENT = 1e-3, 1e-30, 1e4

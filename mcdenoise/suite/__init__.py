@@ -10,7 +10,6 @@ from mcdenoise.suite.tables import (
     error_against_time,
     lines_of,
     markdown,
-    picked_lines,
     sample_curves,
     with_peers,
 )
@@ -27,7 +26,6 @@ __all__ = [
     "lines_of",
     "markdown",
     "open_row",
-    "picked_lines",
     "render_suite",
     "rows_there",
     "sample_curves",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import geometric_mean
 
@@ -13,7 +13,6 @@ from mcdenoise.suite.rows import Row
 
 SMAPE, PSNR, TEMPORAL = "SMAPE", "PSNR 2.2", "tRMSE"
 SHOWN = (SMAPE, PSNR, TEMPORAL)
-PICKED = "the model that `mcdenoise denoise` picks"
 # With noisy features, OIDN uses the same network for high and balanced quality.
 _PEERS = (
     "oidn(quality=fast|balanced, auxiliary=clean|noisy, source=raw|accumulated),"
@@ -96,30 +95,6 @@ def lines_of(results: Results, rows: Iterable[Row], *, curve: bool = False) -> l
         for row in own
         if (cell := _cell(results, row, method.name)) is not None
     ]
-
-
-def picked_lines(results: Results, lines: Iterable[Line], picks: Mapping[str, str]) -> list[Line]:
-    """The lines of the model that `mcdenoise denoise` picks on each row, under the name :data:`PICKED`.
-
-    Args:
-        results: of the benchmark.
-        lines: see :func:`lines_of`.
-        picks: name of the model by row; other rows are skipped.
-
-    Returns:
-        A line for each row, of the model without settings and with the shipped weights. If there are several such
-        methods, one for each precision, the first counts. Empty if the model was not measured on one of the rows.
-    """
-    lines = [line for line in lines if line.row in picks]
-    plain = [method for method in results.methods if not method.settings and not method.weights]
-    by_place = {(line.row, line.model): line for line in lines}
-    picked = []
-    for row in dict.fromkeys(line.row for line in lines):
-        names = [method.name for method in plain if method.model == picks[row] and (row, method.name) in by_place]
-        if not names:
-            return []
-        picked.append(replace(by_place[row, names[0]], model=PICKED))
-    return picked
 
 
 def _cell(results: Results, row: Row, method: str) -> Cell | None:

@@ -36,7 +36,7 @@ class TrainConfig:
     Args:
         model: a name in the zoo, or your own path/to/file.py:factory or package.module:factory.
         settings: arguments of the model's constructor, such as width=16,cascade=K+P.
-        start_from: a model with weights, which the layers of the same names start with, such as cascaded_v2 or
+        start_from: a model with weights, which the layers of the same names start with, such as wild or
             oidn_open(quality=fast); all by default start with random weights.
         losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
             for the result and for the stage initial, if the model has one.
@@ -56,9 +56,6 @@ class TrainConfig:
         gradient_norm: largest norm of a step's gradient; 0 does not limit it.
         ema: decay of an exponential moving average of the weights, such as 0.999; smaller in the first steps. The
             average is validated, and is the result of the run. 0 uses the weights themselves.
-        draw_resolutions: in each step, draw how many of its resolutions a multi-resolution model uses. If all were used
-            in every step, the low frequencies of a larger one would never be trained and drift, since those of the
-            smaller one replace them.
         start_every: a shot of a model that accumulates also begins at every n-th frame, to train on short histories.
         validation_frames: number of frames at the end of each sequence that are kept for validation (the paper's 4); 0
             for a sequence with less than one clip left.
@@ -86,7 +83,6 @@ class TrainConfig:
     key: _Weight = 0.0
     gradient_norm: _Weight = 0.0
     ema: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    draw_resolutions: bool = True
     start_every: _Count = 4
     validation_frames: Annotated[int, Meta(ge=0)] = 4
     lamps: Annotated[float, Meta(ge=0, le=1)] = 0.0

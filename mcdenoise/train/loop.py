@@ -22,7 +22,6 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import (
-    CoarseToFine,
     Model,
     Output,
     State,
@@ -32,7 +31,6 @@ from mcdenoise.models import (
     start_with,
 )
 from mcdenoise.models._defaults import plain_defaults
-from mcdenoise.models._wrapper import parts_of
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import DataFolders, TrainingData
@@ -242,8 +240,7 @@ class Trainer:
         # The seeds of clips differ between processes; this one is the same in all of them.
         torch.manual_seed(self.config.seed * 1_000_003 + step)
         clip = clip.to(self.fabric.device)
-        with _drawn_resolutions(self.network) if self.config.draw_resolutions else nullcontext():
-            output = self.model(clip.buffers)
+        output = self.model(clip.buffers)
         loss = stage_loss(
             output,
             clip["reference"],
@@ -279,20 +276,6 @@ class Trainer:
         scores = validate(split(result)[1], self.losses, data.watched, self.fabric, board, step)
         result.train(training)
         return scores
-
-
-@contextmanager
-def _drawn_resolutions(network: Any) -> Iterator[None]:
-    """Use a random number of resolutions inside this block; a model of one resolution is not changed."""
-    parts = [part for part in parts_of(network, CoarseToFine) if part.resolutions > 1]
-    every = [part.resolutions for part in parts]
-    for part in parts:
-        part.resolutions = int(torch.randint(1, part.resolutions + 1, ()))
-    try:
-        yield
-    finally:
-        for part, resolutions in zip(parts, every, strict=True):
-            part.resolutions = resolutions
 
 
 def _moving_average(network: nn.Module, decay: float) -> AveragedModel:

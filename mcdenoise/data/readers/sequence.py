@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Sequential
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -119,18 +118,6 @@ class Sequence(ABC):
         for number in numbers:
             self._check(number)
         return replace(self, numbers=list(numbers))
-
-    def first_valid_frame(self) -> Frame | None:
-        """The first frame without damage, by which to choose a model; ``None`` for files of a renderer.
-
-        With one sample, features of those are from the pixel centre whatever the filter is, so that they decide
-        nothing.
-        """
-        for number in self.numbers if self.layout != "files" else ():
-            # A damaged frame is reported when it is denoised.
-            with suppress(InputError):
-                return self.frame(number, reference=False)
-        return None
 
     @any_values
     def frame(
