@@ -16,11 +16,6 @@ _LEAST_SLOPE, _EVEN = 4e-3, 0.1
 _UNLIKE, _MOST_SPECKS = 0.1, 0.0045
 
 
-def has_exact_features(frame: Frame) -> bool:
-    """Whether features have no noise: they come from the pixels' centres, and no ray was scattered."""
-    return has_centred_features(frame) and not has_scattered_features(frame)
-
-
 def has_centred_features(frame: Frame) -> bool:
     """Whether features come from one ray through the centre of each pixel.
 

@@ -75,9 +75,9 @@ def test_compiled_kernels_denoise_alike(name: str) -> None:
     pytest.importorskip("numba")
     frames = shot(height=90, width=120)
     with ops.use("numba", strict=False):
-        expected = denoised("cascaded_v2_micro", frames)
+        expected = denoised("wild_small", frames)
         with default(name):
-            found = denoised("cascaded_v2_micro", frames)
+            found = denoised("wild_small", frames)
     assert all(map(torch.equal, found, expected))
 
 
@@ -153,7 +153,7 @@ WRONG: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("wrong", WRONG, ids=str)
 def test_an_argument_of_another_kind_is_told_by_its_name(wrong: dict[str, Any]) -> None:
-    message = refused(lambda: Denoiser(**{"model": "cascaded_v2_micro", **wrong}))
+    message = refused(lambda: Denoiser(**{"model": "wild_small", **wrong}))
     assert next(iter(wrong)) in message or str(next(iter(wrong.values()))) in message
 
 

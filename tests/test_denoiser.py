@@ -290,23 +290,23 @@ def test_a_state_keeps_its_structure(first: Any, second: Any, same: bool) -> Non
 
 
 def test_settings_are_those_of_the_model(weights: Path) -> None:
-    denoiser = Denoiser("cascaded_v2_micro", alpha_min=0.3, anti_lag=False)
+    denoiser = Denoiser("wild_small", alpha_min=0.3, anti_lag=False)
     accumulated = next(parts_of(denoiser.model, Accumulated))
     assert (accumulated.alpha_min, accumulated.lag_threshold) == (0.3, float("inf"))
-    for make in (lambda: Denoiser("cascaded_v2", width=9), lambda: Denoiser("cascaded_v2", weights=weights, width=9)):
+    for make in (lambda: Denoiser("cascaded", width=9), lambda: Denoiser("cascaded", weights=weights, width=9)):
         message = refused(make)
         assert (
-            "but alpha_min, anti_lag, tolerance, restore beside its weights, found width=9; the weights fix width"
+            "but alpha_min, position_limit, normal_limit beside its weights, found width=9; the weights fix width"
             in message
         )
-    message = refused(lambda: Denoiser("oidn_tuned", fractoin=torch.zeros(9, 9)))
+    message = refused(lambda: Denoiser("wild", tolerence=torch.zeros(9, 9)))
     assert message == (
-        "argument 'fractoin': expected an argument of Denoiser or a setting of model 'oidn_tuned' (size, fraction, "
-        "restore), found none of this name; did you mean fraction?"
+        "argument 'tolerence': expected an argument of Denoiser or a setting of model 'wild' (size, stem, alpha_min, "
+        "anti_lag, tolerance), found none of this name; did you mean tolerance?"
     )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"
     assert refused(lambda: Denoiser(Keep(), weights=weights)) == "weights: expected a model's name, found a model"
-    assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("cascaded_v2", alpha_min=2.0))
+    assert "alpha_min: expected in (0, 1], found 2.0" in refused(lambda: Denoiser("wild", alpha_min=2.0))
 
 
 # Derivatives

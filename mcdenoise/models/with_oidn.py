@@ -54,8 +54,9 @@ class WithOidn(Wrapper):
     output. OIDN always takes the whole image with a mirrored border, or, if its noise is correlated
     (:func:`mcdenoise.noise.noise_is_spread`), four images of half the size.
 
-    Features without noise (:func:`mcdenoise.sampling.has_exact_features`) are taken as they are, which takes half the
-    time and keeps textures of single pixels: ``oidn_clean`` is for them, and ``oidn_albedo`` is the frame's.
+    Features without noise, which come from the pixels' centres without a scattered ray
+    (:func:`mcdenoise.sampling.has_scattered_features`), are taken as they are, which takes half the time and keeps
+    textures of single pixels: ``oidn_clean`` is for them, and ``oidn_albedo`` is the frame's.
 
     Args:
         inner: any method.

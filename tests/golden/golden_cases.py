@@ -7,7 +7,6 @@ the digests prove that a change of the code changes no image.
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,8 @@ from mcdenoise.models import Model, list_models
 from mcdenoise.models._registry import find_model
 
 FILE = Path(__file__).with_name("golden.safetensors")
-# Those that call Open Image Denoise's library, and those that have no weights yet.
-_LEFT_OUT = ("oidn", "oidn_temporal", "oidn_open", "wild*")
-METHODS = [name for name in list_models() if not any(fnmatch(name, pattern) for pattern in _LEFT_OUT)]
+# Without those that call Open Image Denoise's library.
+METHODS = [name for name in list_models() if name not in ("oidn", "oidn_temporal", "oidn_open")]
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 # The changes in the file are those of two or three roundings. They are random, so the root mean square of those of
 # another machine is hardly three times as large. The maximum of a few underestimates the true maximum, but hardly by
@@ -166,16 +164,14 @@ EXACT = ("asvgf", "bmfr", "svgf")
 WHOLE = ("accumulated", "anf", "asvgf", "bmfr", "noisy", "nppd", "rae", "svgf")
 # The members of a family differ by their sizes: the tests that are not slow are of the smallest one, and one method of
 # each kind is tested in all ways.
-FAMILIES = ("cascaded_v2*", "cascaded_v3*", "oidn_tuned*")
-SMALLEST = ("cascaded_v2_micro", "cascaded_v3_micro", "oidn_tuned_small")
-KINDS = (*SMALLEST, "accumulated", "joint_bilateral", "kpcn", "rae", "sbmc", "svgf")
-# For the others, tiles of a still shot are not skipped.
-SKIPPING = ("cascaded_v2_micro", "cascaded_v3_micro")
+LARGER, SMALLEST = ("wild", "wild_large"), "wild_small"
+KINDS = (SMALLEST, "accumulated", "joint_bilateral", "kpcn", "rae", "sbmc", "svgf")
 
 
 def ways_of(method: str) -> list[str]:
     """The ways in which a method is tested."""
-    skips, learns = method in SKIPPING, find_model(method).kind != "filter"
+    # For the others, tiles of a still shot are not skipped.
+    skips, learns = method == SMALLEST, find_model(method).kind != "filter"
     return [
         way
         for way, what in WAYS.items()
@@ -187,10 +183,9 @@ def ways_of(method: str) -> list[str]:
 
 def is_slow(method: str, way: str) -> bool:
     """Whether the test is not needed each time, because others show as much of most errors."""
-    large = method not in SMALLEST and any(fnmatch(method, family) for family in FAMILIES)
     if WAYS[way].shot is STILL:
-        return way != "skipped" or method != "cascaded_v2_micro"
-    return large or (way not in ("whole", "gradients") and method not in KINDS)
+        return way != "skipped"
+    return method in LARGER or (way not in ("whole", "gradients") and method not in KINDS)
 
 
 def precision_of(method: str, way: str) -> str:

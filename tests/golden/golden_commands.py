@@ -50,7 +50,7 @@ def same(found: str, expected: str) -> bool:
 
 
 def written(folder: Path, out: Path) -> Tensor:
-    """Means of 4x4 cells of every channel that `denoise` writes with the model that it picks, ``(channels, 16)``."""
+    """Means of 4x4 cells of every channel that `denoise` writes with the default model, ``(channels, 16)``."""
     said("denoise", folder, "-o", out, "--precision", "float32")
     return torch.cat([torch.zeros(0, 16), *(_cells(path) for path in sorted(out.glob("**/*.exr")))])
 
@@ -72,7 +72,7 @@ def losses(folder: Path) -> Tensor:
     for number, frame in enumerate(MOVING.frames()):
         for name in ("color", "albedo", "normal", "depth", "position", "reference"):
             _write(folder / "shot" / f"{name}{number}.exr", frame.buffer(name))
-    options: dict[str, Any] = {"model": "cascaded_v2_micro", "start-from": "cascaded_v2_micro", "steps": STEPS}
+    options: dict[str, Any] = {"model": "wild_small", "start-from": "wild_small", "steps": STEPS}
     options |= {"batch": 2, "frames": 2, "crop": 32, "validation-frames": 0, "checkpoint-every": 1}
     given = [text for name, value in options.items() for text in (f"--{name}", value)]
     said("train", folder / "shot", "-o", folder / "run", *given)

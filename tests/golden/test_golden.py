@@ -12,6 +12,7 @@ from golden_cases import (
     ALLOWED,
     ALLOWED_EXACT,
     METHODS,
+    SMALLEST,
     WAYS,
     Digests,
     change,
@@ -63,18 +64,18 @@ def test_images_agree_with_the_file(method: str, way: str) -> None:
 
 
 def test_tiles_of_the_still_shot_are_skipped() -> None:
-    wrong = differences("cascaded_v2_micro", "skipped", keep_all=True)
+    wrong = differences(SMALLEST, "skipped", keep_all=True)
     assert {message.split(": ")[2] for message in wrong} == {"passed", "reused"}
 
 
 @pytest.mark.parametrize("way", ["whole", "bfloat16", "gradients"])
 def test_small_errors_of_weights_and_histories_are_found(way: str) -> None:
-    other = create_model("cascaded_v2_micro", pretrained=True)
+    other = create_model(SMALLEST, pretrained=True)
     with torch.no_grad():
         for parameter in other.parameters():
             parameter.mul_(1 + (1e-2 if way == "bfloat16" else 1e-5))
-    assert differences("cascaded_v2_micro", way, other)
-    assert differences("cascaded_v2_micro", way, alpha_min=0.6)
+    assert differences(SMALLEST, way, other)
+    assert differences(SMALLEST, way, alpha_min=0.6)
 
 
 def test_the_file_has_every_method_and_is_small() -> None:

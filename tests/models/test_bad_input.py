@@ -249,9 +249,8 @@ def test_weights_of_another_method_or_width_are_refused(name: str, tmp_path: Pat
             assert f"expected weights of model '{name}', found those of '{other}'" in message
             assert refused(lambda: Denoiser(name, weights=path)) == message
     path.write_bytes(weights_of(name))
-    others: dict[str, dict[str, Any]] = {"oidn_tuned": {"size": "large"}, "oidn_tuned_small": {"size": "base"}}
-    others["oidn_tuned_exact"] = others["oidn_tuned"]
-    size = {"width": 2 * WIDTH} if "width" in find_model(name).architecture else others.get(name, {"layers": 2})
+    architecture = find_model(name).architecture
+    size = {"width": 2 * WIDTH} if "width" in architecture else {"stem": 3} if "stem" in architecture else {"layers": 2}
     message = refused(lambda: load_weights(path, name, **size))
     ((setting, value),) = size.items()
     assert message.startswith(f"model '{name}': expected no settings")

@@ -80,7 +80,7 @@ def test_a_step_reads_nothing(name: str) -> None:
 
 
 def test_a_step_with_layers_alpha_and_stages_reads_nothing() -> None:
-    model = small("cascaded_v2_tiny")
+    model = small("cascaded")
     denoiser, frames = Denoiser(model, alpha=True), shot(model)
     with ops.use("torch"), without_reads(), Reads() as reads:
         for frame in frames:
@@ -134,7 +134,7 @@ def test_the_counter_sees_a_read(way: str) -> None:
     assert as_on_a_gpu(Denoiser(model), shot(model, 1))[1]
 
 
-@pytest.mark.parametrize("name", ["cascaded_v2_micro", "kpcn", "nppd", "rae", "bmfr", "joint_bilateral"])
+@pytest.mark.parametrize("name", ["wild_small", "kpcn", "nppd", "rae", "bmfr", "joint_bilateral"])
 def test_the_images_are_those_of_a_step_that_looks(name: str) -> None:
     model = small(name)
     frames = shot(model)
@@ -151,7 +151,7 @@ def test_the_images_are_those_of_a_step_that_looks(name: str) -> None:
 
 @torch.no_grad()
 def test_a_report_is_complete_when_it_is_asked_for() -> None:
-    model = create_model("cascaded_v2_micro", pretrained=True)
+    model = create_model("wild_small", pretrained=True)
     frames = shot(model, 2)
     frames[1].color[0, :, 5, 6:9] = torch.nan
     denoiser = Denoiser(model)
@@ -221,7 +221,7 @@ def test_an_image_that_is_not_finite_is_told_late() -> None:
 
 
 def test_repairs_are_those_of_validation() -> None:
-    frame = whole_frame(small("cascaded_v2"), *SIZE)
+    frame = whole_frame(small("wild_small"), *SIZE)
     frame.color[0, 1, 3, 4] = torch.inf
     frame.color[0, 0, 20, 30:33] = -1
     frame = frame.replace(albedo=frame.albedo * 1.9, normal=frame.normal * 1.001, layers={"half": frame.color / 2})
@@ -289,7 +289,7 @@ def test_stages_are_timed_without_waiting(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_streamed_frame_waits_for_no_mark(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_times, "Stopwatch", Behind)
     monkeypatch.setattr(_report, "Stopwatch", Behind)
-    model = small("cascaded_v2_micro")
+    model = small("wild_small")
     denoiser = Denoiser(model)
     frames = shot(model, 2)
     with ops.use("torch"), without_reads():

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from toys import Same, frame_of, one_of_each, refused, small, still, whole_frame
+from toys import Same, cascade, frame_of, one_of_each, refused, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, Skipping, Tiled, list_models
@@ -33,9 +33,9 @@ MODELS = [
 # For the other methods the library decides on derivatives, or there are none.
 DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
 # The alpha of a method without kernels is filtered by its own noise; its layers are split by their fractions.
-WITHOUT_KERNELS = (*OIDN, "oidn_tuned", "oidn_tuned_exact", "oidn_tuned_small", "rae", "wild", "wild_small")
+WITHOUT_KERNELS = (*OIDN, "rae", "wild")
 # The history of these is of images, or of hidden features, alone: no layer of a frame reaches the next frame's layers.
-HISTORY_OF_IMAGES = ("oidn_tuned", "oidn_tuned_exact", "oidn_tuned_small", "rae")
+HISTORY_OF_IMAGES = ("rae",)
 NAMES = ("diffuse", "glossy", "emission")
 SIZE = (24, 40)
 
@@ -202,7 +202,7 @@ def _modules(model: Any) -> list[Any]:
 
 def test_any_parts_of_the_color_may_be_asked_for() -> None:
     """A layer does not depend on which others are asked for with it."""
-    every, some = Denoiser(small("cascaded_v2")), Denoiser(small("cascaded_v2"))
+    every, some = Denoiser(cascade()), Denoiser(cascade())
     for frame in shot(every.model):
         expected = every.output(frame)
         found = some.output(with_layers(frame, glossy=frame.layers["glossy"]))
@@ -211,7 +211,7 @@ def test_any_parts_of_the_color_may_be_asked_for() -> None:
 
 
 def test_stages_are_asked_for_by_themselves() -> None:
-    denoiser = Denoiser(small("cascaded_v2"))
+    denoiser = Denoiser(cascade())
     frame = shot(denoiser.model, 1)[0]
     assert denoiser.output(frame, stages=False).stages.keys() <= {"accumulated", "initial"}
     denoiser.reset()
@@ -411,7 +411,7 @@ def test_layers_pass_through_every_wrapper() -> None:
 
 @torch.no_grad()
 def test_where_layers_are_asked_for_no_tile_is_passed_through_or_used_again() -> None:
-    denoiser = Denoiser(small("cascaded_v2"))
+    denoiser = Denoiser(cascade())
     color = torch.full((1, 3, 40, 304), 0.5)
     for number in range(12):
         part = torch.rand(color.shape, generator=torch.Generator().manual_seed(number)) * color

@@ -231,7 +231,7 @@ def test_a_module_that_returns_an_output_alone_lacks_a_state() -> None:
 
 def test_zeros_stand_for_no_history() -> None:
     """They do for the whole of a model, so that a graph whose state is an input can begin with them."""
-    model = create_model("cascaded_v2_micro", pretrained=True)
+    model = create_model("wild_small", pretrained=True)
     color, position = torch.rand(1, 3, *SIZE), torch.rand(1, 3, *SIZE) + 1
     camera = torch.eye(4).roll(-1, 1)[None] + 0.01 * torch.eye(4)
     surface = {"normal": nn.functional.normalize(position), "depth": position[:, 2:]}

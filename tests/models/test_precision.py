@@ -128,32 +128,32 @@ def test_a_limit_of_instructions_is_another_machine(monkeypatch: pytest.MonkeyPa
 
 def test_who_gets_it(measured: list[float]) -> None:
     measured.append(2.0)
-    assert Denoiser("cascaded_v2_micro").precision == "bfloat16"
+    assert Denoiser("wild_small").precision == "bfloat16"
     # The effect on these methods has not been measured.
     for others in (
-        Denoiser("cascaded_v2_micro", differentiable=True),
+        Denoiser("wild_small", differentiable=True),
         Denoiser("joint_bilateral"),
         Denoiser(torch.nn.Conv2d(3, 3, 1)),
-        Denoiser("cascaded_v2_micro", precision="float32"),
+        Denoiser("wild_small", precision="float32"),
     ):
         assert others.precision == "float32"
     with pytest.raises(InputError, match=r"precision: .*'int4'"):
-        Denoiser("cascaded_v2_micro", precision="int4")  # type: ignore[arg-type]
+        Denoiser("wild_small", precision="int4")  # type: ignore[arg-type]
 
 
 def test_the_report_says_why_and_the_image_is_that_of_the_precision(measured: list[float]) -> None:
     measured.append(2.0)
     frame = Frame(color=torch.rand(1, 3, 24, 32))
-    chosen, asked = Denoiser("cascaded_v2_micro"), Denoiser("cascaded_v2_micro", precision="bfloat16")
+    chosen, asked = Denoiser("wild_small"), Denoiser("wild_small", precision="bfloat16")
     image = chosen(frame)
     assert torch.equal(image, asked(frame))
     assert chosen.report.precision == "a convolution in bfloat16 takes 0.50 of the time in float32 here"
     assert asked.report.precision == "asked for"
-    array = denoise(frame.color[0].numpy(), layout="CHW", model="cascaded_v2_micro")
+    array = denoise(frame.color[0].numpy(), layout="CHW", model="wild_small")
     assert torch.equal(torch.from_numpy(array), image[0])
 
 
-@pytest.mark.parametrize("name", ["oidn_tuned", "oidn_tuned_small", "cascaded_v2_tiny"])
+@pytest.mark.parametrize("name", ["wild", "wild_small"])
 @pytest.mark.parametrize("noise", [0.003, 0.01, 0.03, 0.1, 0.3])
 def test_no_frame_gets_worse_by_rounding(name: str, noise: float) -> None:
     """An even surface shows most; a checker is its albedo."""

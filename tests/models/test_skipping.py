@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Blur, Mean, Same, Shot, Watching, report_of, small
+from toys import Blur, Mean, Same, Shot, Watching, cascade, report_of
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import Accumulated, Chain, Demodulated, Output, Skipping, Tiled
@@ -64,7 +64,7 @@ def stage(denoiser: Denoiser, name: str) -> Stage:
 
 def pair(model: nn.Module | None = None, tolerance: float = 1e-3) -> tuple[Denoiser, Denoiser]:
     """A denoiser that skips what it can, and one that skips nothing."""
-    model = small("cascaded_v2") if model is None else model
+    model = cascade() if model is None else model
     for skipping in parts_of(model, Skipping):
         skipping.tolerance = tolerance
     return Denoiser(model), Denoiser(model, keep_all=True)
@@ -93,7 +93,7 @@ SHOTS: dict[str, tuple[Callable[[int], Frame], dict[str, float]]] = {
 )
 def test_exact_skipping_changes_no_pixel(precision: Any, shot: str) -> None:
     make, expected = SHOTS[shot]
-    model = small("cascaded_v2", tolerance=0)
+    model = cascade(tolerance=0)
     short, whole = Denoiser(model, precision=precision), Denoiser(model, precision=precision, keep_all=True)
     for number in range(3):
         a, b = short.output(make(number)), whole.output(make(number))
@@ -147,7 +147,7 @@ def test_a_method_of_unknown_reach_runs_and_known_pixels_are_kept() -> None:
 
 
 def test_one_frame_and_the_last_one_are_not_remembered() -> None:
-    denoiser = Denoiser(small("cascaded_v2"))
+    denoiser = Denoiser(cascade())
     for frames, kept in ((1, [False]), (3, [True, True, False]), (None, [True, True, True])):
         denoiser.reset(frames=frames)
         for number, keeps in enumerate(kept):
@@ -217,8 +217,7 @@ def relative(a: Tensor, b: Tensor) -> float:
 
 
 def test_a_tile_without_noise_is_passed_through() -> None:
-    # Detail that the tiles with noise lack would be given back beyond their border, too.
-    short, whole = pair(small("cascaded_v2", restore=False), tolerance=1e-3)
+    short, whole = pair(cascade(), tolerance=1e-3)
     for number in range(12):
         # Noise in the left part only.
         quiet, loud = wall(number, 0.003), wall(number, 1.0)
@@ -297,7 +296,7 @@ def test_a_tile_does_not_switch_to_and_fro() -> None:
 
 
 def test_a_cut_and_a_moving_camera_compute_everything_again() -> None:
-    denoiser = Denoiser(small("cascaded_v2"))
+    denoiser = Denoiser(cascade())
     for number in range(12):
         denoiser(wall(number, 0.003))
     assert stage(denoiser, "converged tiles").skipped == 1
@@ -445,7 +444,7 @@ def test_the_state_has_a_batch() -> None:
 @pytest.mark.slow
 def test_deciding_costs_less_than_a_hundredth_of_the_saved_time() -> None:
     size = (720, 1280)
-    short, whole = (Denoiser("cascaded_v2", keep_all=keep_all) for keep_all in (False, True))
+    short, whole = (Denoiser("wild", keep_all=keep_all) for keep_all in (False, True))
     frame = sky(wall(0, size=size), 400)
     costs, saved = [], []
     for _ in range(3):
@@ -459,7 +458,7 @@ def test_deciding_costs_less_than_a_hundredth_of_the_saved_time() -> None:
 
 
 def test_deciding_on_an_ordinary_frame_takes_next_to_nothing() -> None:
-    denoiser = Denoiser(small("cascaded_v2"))
+    denoiser = Denoiser(cascade())
     frame = wall(0, motion=torch.full((1, 2, HEIGHT, WIDTH), 0.3), normal=draw(3) - 0.5)
     times = []
     for _ in range(5):

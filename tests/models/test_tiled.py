@@ -10,7 +10,7 @@ import pytest
 import torch
 from planes import synthetic
 from torch import Tensor
-from toys import Blur, Brightest, Mean, Same, frame_of, refused, small
+from toys import Blur, Brightest, Mean, Same, cascade, frame_of, refused, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import Skip
@@ -42,7 +42,7 @@ def test_a_method_may_find_an_alpha_in_tiles() -> None:
 
 @pytest.mark.parametrize(("precision", "tile"), [("float32", 64), ("float32", 160), ("bfloat16", 96)])
 def test_tiles_give_the_images_of_whole_frames(precision: Any, tile: int) -> None:
-    model = small("cascaded_v2")
+    model = cascade()
     # Odd sizes, and a sky that is copied: its rectangle is split, too. One after the other, since both set the tiles.
     frames = [synthetic(331, 237, seed) for seed in range(3)]
     whole = Denoiser(model, precision=precision)
@@ -64,7 +64,7 @@ def test_tiles_give_the_images_of_whole_frames(precision: Any, tile: int) -> Non
 
 
 def test_two_denoisers_of_one_model_have_tiles_of_their_own() -> None:
-    model, frame = small("cascaded_v2_micro"), synthetic(160, 96)
+    model, frame = small("wild_small"), synthetic(160, 96)
     whole, tiled = Denoiser(model), Denoiser(model, tile=64)
     assert [tiles.side for tiles in parts_of(model, Tiled)] == [None, None]
     for denoiser, side in ((whole, None), (tiled, 64), (whole, None), (tiled, 64)):
@@ -77,7 +77,7 @@ def test_frames_of_more_than_a_million_pixels_are_prepared_by_rows(monkeypatch: 
     broken = frames[1].color.clone()
     broken[0, 0, ::23, ::31] = torch.nan
     frames[1] = frames[1].replace(color=broken)
-    model = small("cascaded_v2", anti_lag=True)
+    model = cascade()
     at_once = Denoiser(model)
     expected = [at_once.output(frame) for frame in frames]
     assert at_once.report.replaced_pixels == 0
@@ -148,13 +148,11 @@ def test_a_method_that_needs_the_whole_image_is_not_tiled() -> None:
     assert Tiled(FromBuffers(whole, reach=0), 32).halo == 0
 
 
-@pytest.mark.parametrize(
-    ("reach", "stride", "margin", "halo"), [(2, 1, 0, 2), (2, 8, 0, 8), (57, 8, 8, 72), (0, 32, 0, 0)]
-)
-def test_a_halo_holds_reach_and_margin_in_whole_strides(reach: int, stride: int, margin: int, halo: int) -> None:
+@pytest.mark.parametrize(("reach", "stride", "halo"), [(2, 1, 2), (2, 8, 8), (57, 8, 64), (0, 32, 0)])
+def test_a_halo_holds_the_reach_in_whole_strides(reach: int, stride: int, halo: int) -> None:
     toy = Same()
     toy.needs = Needs(reach=reach, stride=stride)
-    assert Tiled(toy, margin=margin).halo == halo
+    assert Tiled(toy).halo == halo
 
 
 def test_tiles_begin_at_multiples_of_the_stride() -> None:
@@ -200,15 +198,13 @@ def test_known_pixels_are_not_computed() -> None:
     assert torch.equal(output.image, known["image"])
 
 
-@pytest.mark.parametrize("name", ["cascaded", "cascaded_v2", "cascaded_v2_tiny", "cascaded_v2_micro"])
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
 @torch.no_grad()
-def test_a_part_of_an_image_is_that_of_the_whole(name: str, top: int, left: int) -> None:
-    """This holds for each network of the zoo."""
+def test_a_part_of_an_image_is_that_of_the_whole(top: int, left: int) -> None:
     frame = frame_of(237, 331, length=torch.ones(1, 1, 237, 331))
     mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
     mask[..., top : top + 60, left : left + 70] = False
-    for tiled in parts_of(small(name).to(memory_format=torch.channels_last), Tiled):
+    for tiled in parts_of(small("cascaded").to(memory_format=torch.channels_last), Tiled):
         given = prepared(tiled, frame)
         whole = tiled(given)[0].image
         part = tiled(given.replace(skip=Skip(mask, {"image": frame.color})))[0].image
@@ -305,8 +301,8 @@ def test_the_largest_tiles_that_fit(loaded: float) -> None:
 
 
 def test_without_a_limit_only_large_frames_are_tiled() -> None:
-    tiles = list(parts_of(create_model("cascaded_v2"), Tiled))
-    assert [each.halo for each in tiles] == [64, 64]
+    tiles = list(parts_of(create_model("cascaded"), Tiled))
+    assert [each.halo for each in tiles] == [56, 64]
     needs = Network(64, max(each.inner.needs.live.bytes(bfloat16=False) for each in tiles))
 
     def chosen(width: int, height: int) -> Tiling:
@@ -341,7 +337,7 @@ def test_too_little_memory_is_told_with_the_least_that_works() -> None:
     ],
 )
 def test_bad_settings(settings: dict[str, Any], expected: str) -> None:
-    assert expected in refused(lambda: Denoiser(small("cascaded_v2"), **settings))
+    assert expected in refused(lambda: Denoiser(cascade(), **settings))
 
 
 def test_a_module_that_computes_no_tiles_has_none() -> None:

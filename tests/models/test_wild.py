@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from toys import frame_of, refused
+from toys import frame_of
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
-from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_WEIGHT
 from mcdenoise.models.wild import _LOGITS, _PACE, Trust, WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -25,18 +24,15 @@ has_oidn = pytest.mark.skipif(
 
 
 def given(length: float) -> Frame:
-    """A frame with this many frames of history, and a previous result."""
+    """A frame with this many frames of history."""
     frame = frame_of(*SIZE).to(torch.float64)
-    draws = torch.Generator().manual_seed(1)
-    alone, before = (torch.rand(1, 3, *SIZE, generator=draws, dtype=torch.float64) for _ in range(2))
-    count = torch.full((1, 1, *SIZE), length, dtype=torch.float64)
-    extra = {PREVIOUS: before, PREVIOUS_WEIGHT: torch.full_like(count, 0.4)}
-    return frame.replace(current=alone, length=count, extra=extra)
+    alone = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return frame.replace(current=alone, length=torch.full((1, 1, *SIZE), length, dtype=torch.float64))
 
 
 def network(own: float, logits: tuple[float, ...], stem: int) -> WildNetwork:
     """A network in float64 that predicts the same image and the same logits for every pixel."""
-    made = WildNetwork(stem=stem, previous=True).double().eval()
+    made = WildNetwork(stem=stem).double().eval()
     bias = made.unet.last.bias
     assert bias is not None
     predicted = [own] * 3 + [(a - b) / _PACE for a, b in zip(logits, _LOGITS, strict=True)]
@@ -56,24 +52,15 @@ def test_the_image_is_the_weighted_mean_of_four_images(length: float | None, ste
     image = network(0.31, logits, stem)(frame)[0].image
     albedo, alone = frame.albedo, frame.color if frame.current is None else frame.current
     assert albedo is not None
-    radiance = [alone, frame.extra[PREVIOUS], frame.color]
-    images = [remodulate(each, albedo) for each in radiance]
-    images[1] = torch.lerp(images[2], images[1], 0.4)
-    images[2] = images[2] if length is None else torch.lerp(images[0], images[2], 0.7)
-    exposure, part = oidn_exposure(remodulate(frame.color, albedo)), 0.4 if length is None else 1 - 1 / length
+    lit, history = (remodulate(each, albedo) for each in (alone, frame.color))
+    images = [lit, history, torch.lerp(lit, history, 0.7)]
+    exposure, part = oidn_exposure(history), 0.0 if length is None else 1 - 1 / length
     weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
         [1, part, part, 1], dtype=torch.float64
     )
     weights /= weights.sum()
     expected = 0.31 * weights[0] + sum(w * compress(x * exposure) for w, x in zip(weights[1:], images, strict=True))
     torch.testing.assert_close(image, demodulate(expand(expected) / exposure, albedo), rtol=1e-12, atol=1e-12)
-
-
-def test_the_previous_result_is_seen_on_request_only() -> None:
-    torch.manual_seed(0)
-    model, frame = WildNetwork().double().eval(), given(4.0)
-    assert PREVIOUS not in model.needs.uses
-    assert torch.equal(model(frame)[0].image, model(frame.replace(extra={}))[0].image)
 
 
 def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
@@ -113,9 +100,3 @@ def test_it_starts_as_the_library() -> None:
     difference = (compress(image * exposure) - compress(expected * exposure)).abs().max()
     # The radiance has a weight of e^-7 / (1 + e^-7), on a scale from 0 to 1.
     assert float(difference) < 0.002
-
-
-def test_settings_are_checked() -> None:
-    assert refused(lambda: create_model("wild", stem=0)) == "stem: expected at least 1, found 0"
-    message = "history: expected accumulated, previous or both, found 'none'"
-    assert refused(lambda: create_model("wild", history="none")) == message

@@ -6,17 +6,15 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from toys import Blur, Brightest, Mean, Same, Watching, frame_of, still
 
 from mcdenoise.frame import Frame, Hints, Skip
 from mcdenoise.models import (
     Accumulated,
     Chain,
-    CoarseToFine,
     Demodulated,
     Exposed,
     Model,
@@ -31,8 +29,7 @@ from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._interface import prepared
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import auto_exposure
-from mcdenoise.ops import demodulate, downsample, remodulate
-from mcdenoise.ops._steps.network import low_frequencies_of
+from mcdenoise.ops import demodulate, remodulate
 
 
 def double(color: Tensor) -> Tensor:
@@ -299,94 +296,3 @@ def test_known_pixels_of_each_stage_are_kept() -> None:
 def test_a_chain_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="methods:"):
         Chain()
-
-
-# CoarseToFine
-
-
-class Constant(nn.Module):
-    """The mean of the whole frame that it sees, and how large that was."""
-
-    needs = Needs(trainable=False, reach=0)
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sizes: list[tuple[int, int]] = []
-
-    def statistics(self, frame: Frame) -> dict[str, Tensor]:
-        maximum = torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
-        return {"exposure": torch.ones_like(maximum), "maximum": maximum}
-
-    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
-        self.sizes.append(frame.size)
-        return Output(frame.color + len(self.sizes)), None
-
-
-def test_a_method_sees_the_image_at_each_size_coarsest_first() -> None:
-    toy, frame = Constant(), frame_of(37, 51)
-    output, state = CoarseToFine(toy, 3)(frame)
-    assert toy.sizes == [(10, 13), (19, 26), (37, 51)]
-    assert state is None
-    exposure, maximum = torch.ones(1, 1, 1, 1), torch.log1p(frame.color.amax((1, 2, 3), keepdim=True))
-    half = downsample(frame.color)
-    expected = downsample(half) + 1
-    expected = low_frequencies_of(half + 2, expected, maximum, exposure)
-    expected = low_frequencies_of(frame.color + 3, expected, maximum, exposure)
-    torch.testing.assert_close(output.image, expected)
-    toy.sizes.clear()
-    output, _ = CoarseToFine(toy, 1)(frame)
-    assert torch.equal(output.image, frame.color + 1)
-
-
-def test_lower_resolutions_are_not_computed_where_all_is_known() -> None:
-    toy, frame = Constant(), frame_of(37, 51)
-    mask = torch.ones(1, 1, 37, 51, dtype=torch.bool)
-    output, _ = CoarseToFine(Tiled(toy), 3)(frame.replace(skip=Skip(mask, {"image": 2 * frame.color})))
-    assert torch.equal(output.image, 2 * frame.color)
-    assert toy.sizes == []
-
-
-def test_its_reach_is_that_of_the_coarsest_size() -> None:
-    toy = Constant()
-    toy.needs = Needs(reach=5, stride=8)
-    assert CoarseToFine(toy, 1).needs.stride == 8
-    assert CoarseToFine(toy, 3).needs == Needs(reach=(5 + 8) * 4, stride=32)
-
-
-def test_low_frequencies_are_those_of_the_coarse_image() -> None:
-    fine, coarse = 0.5 + torch.rand(2, 3, 40, 48, dtype=torch.float64), torch.full((2, 3, 20, 24), 3.0).double()
-    # Every block has the same mean, so that nothing is interpolated.
-    fine[..., 8:, :] = fine[..., :8, :].repeat(1, 1, 4, 1)
-    fine[..., 8:] = fine[..., :8].repeat(1, 1, 1, 5)
-    result = low_frequencies_of(fine, coarse, torch.full((2, 1, 1, 1), 9.0).double())
-    mean = fine[..., :8, :8].mean((-2, -1), keepdim=True)
-    torch.testing.assert_close(result, fine * (3 + 1e-3) / (mean + 1e-3), rtol=1e-12, atol=0)
-
-
-@pytest.mark.parametrize("size", [(40, 48), (37, 51), (1, 9), (8, 1)])
-def test_low_frequencies_of_its_own_change_nothing(size: tuple[int, int]) -> None:
-    fine = torch.rand(1, 3, *size, dtype=torch.float64)
-    result = low_frequencies_of(fine, downsample(fine), torch.log1p(fine.amax((1, 2, 3), keepdim=True)))
-    torch.testing.assert_close(result, fine, rtol=1e-12, atol=0)
-
-
-def test_low_frequencies_of_a_lamp_stay_off_the_wall_beside_it() -> None:
-    """The lamp grows by a tenth; the wall, a millionth of it, does not grow by a tenth of the lamp."""
-    fine = torch.full((1, 3, 32, 32), 1e-2, dtype=torch.float64)
-    fine[..., 8:16, 8:16] = 1e4
-    coarse = downsample(fine)
-    coarse[..., 4:8, 4:8] *= 1.1
-    result = low_frequencies_of(fine, coarse, torch.full((1, 1, 1, 1), 9.0).double())
-    lamp = torch.zeros(32, 32, dtype=torch.bool)
-    lamp[8:16, 8:16] = True
-    assert result[..., lamp].unique().tolist() == [pytest.approx(np.expm1(9.0))]
-    assert result[..., ~lamp].min() > 1e-2 * (1 - 1e-9)
-    assert result[..., ~lamp].max() < 1.1e-2 * (1 + 1e-9)
-
-
-def test_low_frequencies_are_differentiable() -> None:
-    fine, coarse = (torch.rand(1, 1, side, 9 if side > 5 else 5, dtype=torch.float64) + 0.1 for side in (10, 5))
-    maximum = torch.full((1, 1, 1, 1), 5.0, dtype=torch.float64)
-    arguments = (fine.requires_grad_(), coarse.requires_grad_())
-    assert torch.autograd.gradcheck(lambda *images: low_frequencies_of(*images, maximum), arguments)
-    assert torch.autograd.gradgradcheck(lambda *images: low_frequencies_of(*images, maximum), arguments)

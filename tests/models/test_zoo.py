@@ -17,7 +17,6 @@ WRONG: dict[str, dict[str, Any]] = {
     "asvgf": {"alpha": 0.0},
     "bmfr": {"alpha_min": 0.0, "second_alpha": 2.0},
     "cascaded": {"cascade": "K+K+K"},
-    "cascaded_v2": {"tolerance": -1},
     "guided": {"radius": 0, "eps": torch.nan},
     "joint_bilateral": {"sigma_color": 0, "sigma_space": torch.inf},
     "kpcn": {"width": 0, "layers": 1, "kernel_size": 4},
@@ -29,6 +28,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "oidn_temporal": {"auxiliary": "clean", "engine": "none", "prefilter": "none", "history": 0.0},
     "sbmc": {"width": 0, "rounds": 0, "convolutions": 0, "kernel_size": 0},
     "svgf": {"alpha": 0.0},
+    "wild": {"stem": 0, "alpha_min": 0, "tolerance": -1},
     "wskp": {"layers": 1},
 }
 
@@ -44,7 +44,6 @@ def test_a_setting_out_of_its_range_is_refused(name: str, setting: str) -> None:
 # The numbers of weights of the papers or of their public code, and of the default.
 SIZES = [
     ("anf", {}, 190_432),
-    ("cascaded_v2", {}, 547_673),
     ("kpcn", {"width": 100, "layers": 9, "kernel_size": 21}, 2 * 2_921_241),
     ("mrkp", {}, 341_838),
     ("nbgd", {"layers": 2}, 7_525),
@@ -52,6 +51,7 @@ SIZES = [
     ("nppd", {"width": 96}, 15_593_341),
     ("nppd", {"width": 128, "backbone": "convunext"}, 33_446_525),
     ("rae", {}, 1_521_529),
+    ("wild", {}, 939_856),
 ]
 
 
@@ -63,10 +63,10 @@ def test_the_number_of_weights(name: str, settings: dict[str, Any], expected: in
 
 
 # Methods that keep something of the frame before, one of each kind.
-WITH_HISTORY = ["accumulated", "anf", "asvgf", "bmfr", "cascaded_v3_micro", "nppd", "oidn_tuned_small", "rae", "svgf"]
+WITH_HISTORY = ["accumulated", "anf", "asvgf", "bmfr", "nppd", "rae", "svgf", "wild_small"]
 
 
-@pytest.mark.parametrize("name", ["accumulated", "anf", "cascaded_v2_micro", "nppd", "oidn_tuned_small", "rae"])
+@pytest.mark.parametrize("name", ["accumulated", "anf", "nppd", "rae", "wild_small"])
 @torch.no_grad()
 def test_a_state_of_zeros_is_that_of_no_frame(name: str) -> None:
     model = small(name)

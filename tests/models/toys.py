@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from mcdenoise import ops
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, create_model
+from mcdenoise.models import Accumulated, Demodulated, Exposed, Model, Needs, Output, Skipping, create_model
 from mcdenoise.models._registry import find_model
 from mcdenoise.models._report import FrameReport
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.ops._backend import Backend
 
 
@@ -105,6 +106,12 @@ def small(name: str, **settings: Any) -> Any:
             if parameter.dim() > 1 and not parameter.any():
                 nn.init.normal_(parameter, std=0.02)
     return model
+
+
+def cascade(**settings: Any) -> Any:
+    """The paper's cascade, small, behind a history and :class:`Skipping`, whose settings these are."""
+    (networks,) = parts_of(small("cascaded"), Exposed)
+    return Demodulated(Accumulated(Skipping(networks, **settings))).eval()
 
 
 class Same(nn.Module):

@@ -24,7 +24,7 @@ class Mutant(NamedTuple):
         return f"{self.target}: {self.right} -> {self.wrong or 'nothing'}"
 
 
-_MODEL = "model:cascaded_v2_micro"
+_MODEL = "model:wild_small"
 _MOTION, _LAG = "motion_from_position", "history_lag"
 
 MUTANTS = tuple(
@@ -105,7 +105,8 @@ MUTANTS = tuple(
             "first, second = mean.to(moments.dtype).to(mean.dtype).split(1, 1)",
         ),
         # Models.
-        (_MODEL, "nn/inputs.py", "torch.where(lit, key / typical, 1)", "torch.where(lit, key, 1)"),
-        (_MODEL, "ops/_steps/network.py", "torch.log1p(current * exposure)", "torch.log1p(current)"),
+        (_MODEL, "nn/oidn.py", "_KEY / torch.exp2(mean)", "_KEY"),
+        (_MODEL, "ops/_steps/wild.py", "expand(mixed) / exposure", "expand(mixed)"),
+        ("model:cascaded", "nn/inputs.py", "torch.where(lit, key / typical, 1)", "torch.where(lit, key, 1)"),
     )
 )

@@ -13,7 +13,7 @@ from mcdenoise.check.case import Case, Op
 from mcdenoise.check.stability._ops import check_op, select
 from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops._op import backends_of
-from mcdenoise.ops._steps import history, network
+from mcdenoise.ops._steps import history
 
 every_step = pytest.mark.parametrize("step", STEPS, ids=lambda step: step.name)
 every_case = pytest.mark.parametrize(
@@ -24,9 +24,8 @@ every_case = pytest.mark.parametrize(
 def test_every_step_is_in_the_table() -> None:
     functions = [
         function
-        for module in (history, network)
-        for name, function in inspect.getmembers(module, inspect.isfunction)
-        if not name.startswith("_") and function.__module__ == module.__name__
+        for name, function in inspect.getmembers(history, inspect.isfunction)
+        if not name.startswith("_") and function.__module__ == history.__name__
     ]
     assert {step.function for step in STEPS} == {each for each in functions if len(backends_of(each)) > 1}
 
@@ -38,7 +37,6 @@ def test_is_its_formula(step: Op, case: Case, backend: str) -> None:
     expected = oracle(step.name)(**case.inputs(), **case.settings)
     pairs = [(found, expected)] if isinstance(found, Tensor) else zip(found, expected, strict=True)
     for result, formula in pairs:
-        # The plain softplus is the number itself from 20 on.
         torch.testing.assert_close(result.double(), formula, rtol=1e-6 if result.ndim == 1 else 1e-9, atol=1e-12)
 
 

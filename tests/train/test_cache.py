@@ -101,7 +101,7 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
 class Recorder:
     """A method that does nothing to a frame and keeps it."""
 
-    needs = create_model("cascaded_v2_micro").needs
+    needs = create_model("wild_small").needs
 
     def __init__(self, seen: list[Frame]) -> None:
         self.seen = seen

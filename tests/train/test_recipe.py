@@ -16,7 +16,7 @@ from mcdenoise.train import Recipe, clean_references
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 TINY = RECIPES / "tiny.toml"
-WEIGHTS = "cascaded_v2_micro.safetensors"
+WEIGHTS = "wild_small.safetensors"
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_from_nothing_to_weights(trained: Path) -> None:
     errors, expected, weights = printed.splitlines()
     scores = json.loads((trained / "log.jsonl").read_text().splitlines()[-1])["validation"]
     assert errors.startswith(f"validation  smape {scores['smape']:.4f}  psnr {scores['psnr']:.4f}")
-    assert expected == f"expected a smape of at most 0.139 + 0.01, found {scores['smape']:.4f}: met"
+    assert expected == f"expected a smape of at most 0.193 + 0.01, found {scores['smape']:.4f}: met"
     assert weights == str(trained / WEIGHTS)
 
 
@@ -124,7 +124,7 @@ def test_the_recipe_that_is_explained(tmp_path: Path) -> None:
         ("steps = 12", 'steps = "12"', "train.steps: expected int, got str"),
         ("steps = 12", "steps = true", "train.steps: expected int, got bool"),
         ("steps = 12", "steps = 0", "train.steps: expected int >= 1"),
-        ('"cascaded_v2_micro"', '"cascade"', "cascade"),
+        ('"wild_small"', '"cascade"', "cascade"),
         ("[[data]]", "[data]", "data: expected array, got object"),
         ('[[data]]\nseeds = "0-1"', '[[data]]\nseed = "0-1"', "unknown field seed; did you mean seeds"),
         ("frames = 3", "frames = 2.5", "[[data]] 1: "),

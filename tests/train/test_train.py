@@ -24,7 +24,7 @@ from torch import Tensor
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
-from mcdenoise.models import DEFAULT, describe_weights, load_weights
+from mcdenoise.models import describe_weights, load_weights
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
 pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -33,7 +33,9 @@ from mcdenoise.train import Progress, RunFolder, TrainConfig, train
 from mcdenoise.train.clips import Clip, ClipSampler
 from mcdenoise.train.config import check_config
 
-SMALL: dict[str, Any] = {"settings": "width=4", "crop": 16, "frames": 2, "batch": 2, "steps": 6, "validation_frames": 1}
+MODEL = "cascaded"
+SMALL: dict[str, Any] = {"model": MODEL, "settings": "width=4", "crop": 16, "frames": 2, "batch": 2, "steps": 6}
+SMALL["validation_frames"] = 1
 FIELDS = {field.name for field in dataclasses.fields(TrainConfig)}
 
 
@@ -64,8 +66,8 @@ class Stopped(Exception):
 
 
 def create_settings(**changed: Any) -> dict[str, Any]:
-    """Every setting that the weights of the default model are of."""
-    return {"width": 40, "kernel_width": None, "kernel_size": 5, "resolutions": 3, "half": False, **changed}
+    """Every setting that the weights of the model are of."""
+    return {"width": 40, "kernel_size": 5, "cascade": "P+K", "bilateral": True, "normalize": "softmax", **changed}
 
 
 def state(run: Path) -> list[Tensor]:
@@ -96,7 +98,6 @@ def test_one_clip_is_learnt_by_heart(shared_sequence: Path, tmp_path: Path, monk
     config = TrainConfig(
         **{**SMALL, "settings": "width=8", "frames": 3, "batch": 1, "steps": 30},
         learning_rate=1e-2,
-        draw_resolutions=False,
     )
     train(config, [shared_sequence], tmp_path / "run", checkpoint_every=10, report=reports.append)
     assert [progress.step for progress in reports] == [10, 20, 30]
@@ -117,7 +118,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(shared_sequence: P
     weights = train(config, [shared_sequence], whole, cache=cache, checkpoint_every=3)
     with pytest.raises(Stopped):
         train(config, [shared_sequence], stopped, cache=cache, checkpoint_every=3, report=stop_at_3)
-    assert not (stopped / f"{DEFAULT}.safetensors").exists()
+    assert not (stopped / f"{MODEL}.safetensors").exists()
     torch.manual_seed(99)
     go_on: dict[str, Any] = {"cache": cache, "checkpoint_every": 3, "report": lambda p: steps.append(p.step)}
     resumed = train(config, [shared_sequence], stopped, **go_on)
@@ -133,7 +134,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(shared_sequence: P
 
 
 def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
-    run, weights = finished, finished / f"{DEFAULT}.safetensors"
+    run, weights = finished, finished / f"{MODEL}.safetensors"
     assert len(list(run.glob("events.out.tfevents*"))) == 1
     config = json.loads((run / "config.json").read_text())
     assert TrainConfig(**config) == TrainConfig(**SMALL)
@@ -152,13 +153,13 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
     assert all(entry["gradient_norm"] > 0 and entry["learning_rate"] == 1e-4 for entry in log)
 
     about = describe_weights(weights)
-    assert (about["architecture"], about["settings"], about["steps"]) == (DEFAULT, create_settings(width=4), "6")
+    assert (about["architecture"], about["settings"], about["steps"]) == (MODEL, create_settings(width=4), "6")
     assert (about["licence"], about["credits"]) == ("Apache-2.0", "A. Painter, CC0")
     assert json.loads(about["config"]) == config
     assert json.loads(about["data"]) == data["sequences"]
     assert json.loads(about["commits"]) == [{"first_step": 0, "commit": start["commit"]}]
     saved = torch.load(run / "checkpoint.pt", weights_only=True)["parts"][0]
-    for key, tensor in load_weights(weights, DEFAULT).state_dict().items():
+    for key, tensor in load_weights(weights, MODEL).state_dict().items():
         assert torch.equal(tensor, saved[key].half().float())
 
 
@@ -222,7 +223,7 @@ def test_a_run_killed_while_it_saves_goes_on_from_the_checkpoint_before(
     command = [sys.executable, "-c", textwrap.dedent(code), *place]
     command += ["--checkpoint-every", "2", "--credits", "A. Painter, CC0", *options(TrainConfig(**SMALL))]
     assert subprocess.run(list(map(str, command)), env=ONE_THREAD, check=False).returncode == -signal.SIGKILL
-    assert not (run / f"{DEFAULT}.safetensors").exists()
+    assert not (run / f"{MODEL}.safetensors").exists()
     assert torch.load(run / "checkpoint.pt", weights_only=True)["step"] == 2
     (left,) = run.glob(".mcdenoise*")
     os.utime(left, (0, 0))
@@ -242,8 +243,8 @@ def test_two_processes_learn_what_one_does(shared_sequence: Path, tmp_path: Path
         command = mcdenoise("train", shared_sequence, *options_of_run, processes=processes)
         result = subprocess.run(command, env=ONE_THREAD, capture_output=True, text=True, check=False)
         assert result.returncode == 0, result.stderr
-        assert result.stdout.split() == [str(run / f"{DEFAULT}.safetensors")]
-        weights.append(load_file(run / f"{DEFAULT}.safetensors"))
+        assert result.stdout.split() == [str(run / f"{MODEL}.safetensors")]
+        weights.append(load_file(run / f"{MODEL}.safetensors"))
     one, two = weights
     # Adam divides each number of a gradient by its own size, so that one which is zero but for the order of its terms
     # may move a weight the other way: by at most a learning rate a step, and there are few of these.
@@ -335,7 +336,7 @@ def test_two_trainings_do_not_share_a_folder(shared_sequence: Path, tmp_path: Pa
         f"{platform.node()} at work in it; wait for it, or choose another folder"
     ]
     # It is free again.
-    (run / f"{DEFAULT}.safetensors").unlink()
+    (run / f"{MODEL}.safetensors").unlink()
     train(config, [shared_sequence], run, checkpoint_every=1)
 
 
@@ -449,7 +450,7 @@ def test_settings_of_no_model_or_data_leave_no_run(
 
 def test_a_run_can_start_from_weights(shared_sequence: Path, finished: Path, tmp_path: Path) -> None:
     """Without a width, the result is of that of the weights, and says so, so that it can be loaded."""
-    first = finished / f"{DEFAULT}.safetensors"
+    first = finished / f"{MODEL}.safetensors"
     config = TrainConfig(**{**SMALL, "steps": 1, "settings": ""}, learning_rate=1e-12)
     second = train(config, [shared_sequence], tmp_path / "run", cache=finished / "cache", initial_weights=first)
     before, after = (load_weights(path).state_dict() for path in (first, second))
