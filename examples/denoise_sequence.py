@@ -1,7 +1,7 @@
 """Denoise a shot frame by frame, as in a renderer: the shortest use of `Denoiser`.
 
     python examples/denoise_sequence.py path/to/sequence out
-    python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/cascaded_v2.safetensors
+    python examples/denoise_sequence.py path/to/sequence out --weights runs/mine/wild.safetensors
 
 The script writes out/denoised0.exr, out/denoised1.exr, ... (scene-linear), and out/last.png: the last frame before and
 after, as displayed. A denoiser has a state: pass it the frames in order, and use one `Denoiser` for each shot. If the

@@ -140,7 +140,7 @@ def compare(
     """Errors of the reflectance by loss and method (``noisy``, ``denoised``), for each noise seed and step."""
     box = Box(variant, size)
     target = box.plain(torch.tensor(TRUE), samples, seed=12345)
-    denoiser = Denoiser("cascaded_v2_micro", differentiable=True)
+    denoiser = Denoiser("wild_small", differentiable=True)
     found: dict[tuple[str, str], list[list[float]]] = {}
     for loss in LOSSES:
         for method in METHODS[loss]:

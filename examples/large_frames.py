@@ -1,7 +1,7 @@
 """Measure the cost per pixel of whole processes in frames of any size, within a memory limit.
 
     python examples/large_frames.py
-    python examples/large_frames.py --sizes 1280x720,3840x2160 --model cascaded_v2_tiny --max-memory 2 --json costs.json
+    python examples/large_frames.py --sizes 1280x720,3840x2160 --model wild_small --max-memory 2 --json costs.json
 
 The script writes a synthetic sequence of each size (color, albedo, normal, depth and position, without cameras, so that
 frames have no history) and denoises it with `mcdenoise denoise --max-memory`, which chooses the tiles. For each size it

@@ -26,7 +26,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 
-METHODS = ("cascaded_v2", "cascaded_v2_small", "cascaded_v2_tiny", "joint_bilateral", "oidn")
+METHODS = ("wild", "wild_small", "joint_bilateral", "oidn")
 Images = dict[str, Tensor]
 
 

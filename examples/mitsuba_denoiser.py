@@ -114,7 +114,7 @@ class Descent:
 
 def optimise(size: int, steps: int) -> list[float]:
     """Maximum error of the walls' reflectance before the first and after each step."""
-    denoiser = MitsubaDenoiser((size, size), albedo=True, normals=True, model="cascaded_v2_micro")
+    denoiser = MitsubaDenoiser((size, size), albedo=True, normals=True, model="wild_small")
     descent = Descent(size, denoiser, samples=256)
     errors = [descent.error()]
     for step in range(steps):
@@ -187,7 +187,7 @@ def main() -> None:
         "--measure", type=int, nargs="+", metavar="SIZE", help="measure run times instead, at these sizes"
     )
     parser.add_argument("--rounds", type=int, default=7, help="rounds of --measure, in which all calls take turns")
-    parser.add_argument("--models", nargs="+", default=["oidn_tuned", "oidn_tuned_small"], help="models to measure")
+    parser.add_argument("--models", nargs="+", default=["wild", "wild_small"], help="models to measure")
     options = parser.parse_args()
 
     mi.set_variant(options.variant)

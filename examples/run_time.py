@@ -1,7 +1,7 @@
 """Measure the run time of methods on one frame without accumulation, that is of their image filters alone.
 
     python examples/run_time.py
-    python examples/run_time.py --models cascaded_v2 "oidn(quality=fast)" mine.py:make --size 1920x1080 --rounds 9
+    python examples/run_time.py --models wild "oidn(quality=fast)" mine.py:make --size 1920x1080 --rounds 9
 
 Every round runs each method once, one after the other, so that other work of the machine affects all of them equally;
 the first round warms up and does not count. The script prints the median and the quartiles, and the ratio to the first

@@ -1,6 +1,6 @@
 """Measure how much time skipping saves, and how it changes the error.
 
-    python examples/skipped.py path/to/scene path/to/another --model cascaded_v2_tiny
+    python examples/skipped.py path/to/scene path/to/another --model wild_small
     python examples/skipped.py path/to/scene --markdown --tolerance 0.01
 
 The script makes five shots of each scene: the original flythrough; the flythrough without albedo; the flythrough with a

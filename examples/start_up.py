@@ -1,7 +1,7 @@
 """Measure whole processes that denoise one frame from EXR to EXR, with this package and with Open Image Denoise.
 
     python examples/start_up.py
-    python examples/start_up.py --size 640x360 --rounds 9 --model cascaded_v2_tiny --precisions auto,float32
+    python examples/start_up.py --size 640x360 --rounds 9 --model wild --precisions auto,float32
 
 Every round starts each process once, one after the other, so that other work of the machine affects all of them
 equally; the first round, in which files are read from the disk and kernels are compiled, does not count. The script
@@ -76,7 +76,7 @@ def seconds(command: list[str]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--model", default="cascaded_v2_tiny")
+    parser.add_argument("--model", default="wild_small")
     parser.add_argument("--precisions", default="auto,float32", help="precisions of mcdenoise, separated by commas")
     parser.add_argument(
         "--quality", default="balanced", choices=["fast", "balanced", "high"], help="quality of the peer"

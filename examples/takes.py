@@ -1,7 +1,7 @@
 """Compare methods with Open Image Denoise on packed takes whose references have been cleaned.
 
     mcdenoise generate --takes --unseen --seeds 900000-900015 -o unseen
-    python examples/takes.py unseen --clean clean --models oidn_temporal oidn_tuned
+    python examples/takes.py unseen --clean clean --models oidn_temporal wild
 
 A reference of a take has 264 samples a pixel; its noise is up to two thirds of the error of a good method, which hides
 what methods differ by; without ``clean``, errors contain it. So ``clean`` gets copies with clean references first
@@ -25,7 +25,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
-from mcdenoise.models import Model
+from mcdenoise.models import DEFAULT, Model
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
 from mcdenoise.train.packed import frame_of
@@ -78,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
     parser.add_argument("--clean", type=Path, metavar="FOLDER", help="for copies with clean references")
-    parser.add_argument("--models", nargs="+", default=["oidn_temporal", "oidn_tuned"], metavar="NAME")
+    parser.add_argument("--models", nargs="+", default=["oidn_temporal", DEFAULT], metavar="NAME")
     parser.add_argument("--json", type=Path, metavar="FILE", help="all errors; takes in it are not measured again")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()

@@ -1,7 +1,7 @@
 """Measure training steps in each precision.
 
     python examples/training_speed.py
-    python examples/training_speed.py SEQUENCE... --model cascaded_v2_small --rounds 10 --json times.json
+    python examples/training_speed.py SEQUENCE... --model wild_small --rounds 10 --json times.json
 
 A step is that of `mcdenoise train`: it draws clips, runs the network forward and backward, and updates the weights and
 their moving average. Without a sequence the clips are random. Every round makes one step in each precision, one after
@@ -73,7 +73,6 @@ def config_of(model: str, precision: Precision, batch: int, frames: int, crop: i
         precision=precision,
         gradient_norm=1.0,
         ema=0.998,
-        draw_resolutions=False,
         validation_frames=0,
     )
 

@@ -1,7 +1,7 @@
 """Compare methods on scenes of your choice: noisy, accumulated, filters, other denoisers, and networks.
 
     python examples/unseen_scenes.py path/to/scene path/to/another --sweep oidn joint_bilateral --markdown
-    python examples/unseen_scenes.py path/to/scene --models runs/mine/cascaded_v2.safetensors,mine.py:make
+    python examples/unseen_scenes.py path/to/scene --models runs/mine/wild.safetensors,mine.py:make
 
 For every scene, and for the mean over the scenes, the script prints means over the frames with a reference: SMAPE,
 relMSE and RMSE (scene-linear, lower is better); PSNR and SSIM (as displayed, higher is better); FLIP (as displayed,
@@ -15,7 +15,7 @@ and high quality; albedo and normal treated as noisy, as clean, or denoised firs
 ("raw"), the accumulated image, the accumulated image divided by albedo, or one sample per pixel with the results
 accumulated by the same rule ("accumulated after"). `joint_bilateral`, kornia's filter of the accumulated image, has 20.
 The file of --json has every setting separately. For a sweep of your own, use for example --models
-"cascaded_v2(alpha_min=0.05|0.1|0.2)".
+"wild(alpha_min=0.05|0.1|0.2)".
 """
 
 import argparse

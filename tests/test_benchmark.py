@@ -269,7 +269,7 @@ def test_missing_methods_are_listed_as_missing(
     assert all(set(cell.errors) >= METRICS and "FLIP" not in cell.errors for cell in results.cells)
     own = results.methods[-1]
     assert own.parameters == sum(parameter.numel() for parameter in small_model().parameters())
-    assert (own.model, own.weights, own.precision) == ("cascaded_v2", str(weights), "bfloat16")
+    assert (own.model, own.weights, own.precision) == ("cascaded", str(weights), "bfloat16")
     assert [fit.method for fit in results.fits] == present[1:]
     assert json.loads(file.read_text()) == asdict(results)
 
@@ -328,9 +328,9 @@ def test_a_method_is_skipped_on_scenes_that_lack_its_buffers(small_sequence: Pat
     [
         ((), "expected a new or an empty folder, found files in it; choose another folder, or remove what is there"),
         (("--models", "cascade"), "model 'cascade': found no model of this name; did you mean cascaded"),
-        (("--models", "cascaded_v2,cascaded_v2"), "methods: expected different names"),
-        (("--models", "cascaded_v2(width)"), "expected settings such as (setting=value), found 'width'"),
-        (("--models", "cascaded_v2(hue=3)"), "argument 'hue': expected an argument of Denoiser or a setting of model"),
+        (("--models", "wild,wild"), "methods: expected different names"),
+        (("--models", "wild(size)"), "expected settings such as (setting=value), found 'size'"),
+        (("--models", "wild(hue=3)"), "argument 'hue': expected an argument of Denoiser or a setting of model"),
         (("--models", "nowhere.py:make"), "nowhere.py: expected a Python file with a factory of a model"),
         (("--precisions", "float8"), "--precisions: expected some of float32, bfloat16"),
         (("--device", "tpu"), "--device: expected cpu or cuda, found 'tpu'"),
@@ -360,13 +360,13 @@ def test_bad_arguments_are_rejected_before_measuring(
 
 
 def test_some_methods_in_some_precisions() -> None:
-    names = "cascaded_v2_tiny(alpha_min=0.1|0.2), cascaded_v2_micro"
+    names = "wild(alpha_min=0.1|0.2), wild_small"
     methods = choose_methods(names, precisions="bfloat16", keep_all=True, baselines=())
-    base = ["cascaded_v2_tiny(alpha_min=0.1)", "cascaded_v2_tiny(alpha_min=0.2)", "cascaded_v2_micro"]
+    base = ["wild(alpha_min=0.1)", "wild(alpha_min=0.2)", "wild_small"]
     assert [method.name for method in methods] == [
         f"{name}, bfloat16{more}" for name in base for more in ("", ", keep all")
     ]
-    assert methods[0].folder == "cascaded_v2_tiny-alpha_min-0.1-bfloat16"
+    assert methods[0].folder == "wild-alpha_min-0.1-bfloat16"
     denoiser = make_method(methods[3]).denoiser
     assert (denoiser.precision, denoiser.keep_all) == ("bfloat16", True)
     (accumulated,) = (part for part in denoiser.model.modules() if isinstance(part, Accumulated))
@@ -374,7 +374,7 @@ def test_some_methods_in_some_precisions() -> None:
 
 
 def test_a_method_named_twice_is_measured_once_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
-    name = "cascaded_v2_micro"
+    name = "wild_small"
     twice = [method.name for method in choose_methods(f"{name},pretrained", precisions="bfloat16")]
     assert twice.count(f"{name}, bfloat16") == 1
     mine = tmp_path / f"{name}.safetensors"
@@ -523,19 +523,19 @@ def test_methods_are_also_measured_without_skipping(small_sequence: Path, out: P
     for number in (1, 2, 3):
         for name in ("world_position", "depth", "shading_normal", "albedo"):
             shutil.copy(inputs / f"{name}0.exr", inputs / f"{name}{number}.exr")
-    arguments = (small_sequence, "-o", out, "--models", "cascaded_v2_tiny", "--precisions", "float32")
+    arguments = (small_sequence, "-o", out, "--models", "wild", "--precisions", "float32")
     status, printed, _ = run(*arguments, "--keep-all", "--sizes", "none", "--rounds", "1")
     assert status == 0
     results = Results.read(out)
     assert results.command.endswith(" --keep-all")
-    short, whole = (results.cell("plane", name) for name in ("cascaded_v2_tiny", "cascaded_v2_tiny, keep all"))
+    short, whole = (results.cell("plane", name) for name in ("wild", "wild, keep all"))
     assert short is not None
     assert whole is not None
     skipped = {row["stage"]: row["skipped"] for row in short.plan}
     assert skipped["reproject"] == 0.75
     assert not any(row["skipped"] for row in whole.plan)
     (row,) = (row for row in results.skipped() if row.method not in ("noisy", "accumulated"))
-    assert (row.scene, row.method) == ("plane", "cascaded_v2_tiny")
+    assert (row.scene, row.method) == ("plane", "wild")
     assert row.stages.startswith("reproject 75%")
     assert row.saved == pytest.approx(whole.computing.median - short.computing.median)
     assert set(row.change) == set(short.errors)

@@ -164,7 +164,7 @@ def test_the_zip_denoises_in_blender_as_the_command_does(frames: Any, archive: P
 
     assert run("4") == ["passes {'FINISHED'}", "animation {'FINISHED'}"]
     # The graph compares surfaces by their depth.
-    same = ("--model", "oidn_tuned", "--keep-all", "--map", "position=", "--layers", "all")
+    same = ("--model", "wild", "--keep-all", "--map", "position=", "--layers", "all")
     succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", *same)
     for number in range(1, 5):
         found, expected = (parts(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out"))

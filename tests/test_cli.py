@@ -121,13 +121,13 @@ def test_unknown_command() -> None:
         ("--threads", "0", "--threads: expected 1 to 1024, found 0"),
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
-        ("--model", "cascaded_v2_tiny", "expected weights of model 'cascaded_v2_tiny', found those of 'cascaded_v2'"),
+        ("--model", "kp", "expected weights of model 'kp', found those of 'cascaded'"),
         (
             "--model",
-            "cascaded_v2(hue=1)",
-            "argument 'hue': expected an argument of Denoiser or a setting of model 'cascaded_v2' (width, ",
+            "wild(hue=1)",
+            "argument 'hue': expected an argument of Denoiser or a setting of model 'wild' (size, ",
         ),
-        ("--model", "oidn_tund", "model 'oidn_tund': found no model of this name; did you mean oidn_tuned or "),
+        ("--model", "wild_smal", "model 'wild_smal': found no model of this name; did you mean wild_small or "),
         ("--model", "joint_bilateral(sigma_color=1", "expected ')' after the settings, found none; add it"),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
     ],
@@ -205,7 +205,7 @@ def missing_frame(inputs: Path) -> None:
 
 def test_a_missing_frame_is_reported_and_skipped(denoise: list[Any], small_sequence: Path, out: Path) -> None:
     missing_frame(small_sequence / "inputs")
-    status, _, errors = run(*denoise)
+    status, _, errors = run(*denoise[:-2], "--model", "wild_small")
     assert (status, len(errors.splitlines())) == (0, 1)
     assert "frames: 1 missing" in errors
     assert sorted(path.stem for path in out.glob("*.exr")) == ["denoised0", "denoised2", "denoised3"]
@@ -331,7 +331,7 @@ def colors(small_sequence: Path, tmp_path: Path) -> Path:
 def test_evaluate_takes_images_or_a_model(small_sequence: Path, colors: Path) -> None:
     evaluate = ["evaluate", small_sequence, colors]
     assert "--protocol" in refuses(*evaluate, "--protocol", "loose")
-    assert f"found both, {colors} and cascaded_v2" in refuses(*evaluate, "--model", "cascaded_v2")
+    assert f"found both, {colors} and wild" in refuses(*evaluate, "--model", "wild")
     assert f"found only the sequence {small_sequence}" in refuses(*evaluate[:2])
 
 
@@ -372,14 +372,15 @@ def test_models(tmp_path: Path) -> None:
 
 def test_train(denoise: list[Any], small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
-    small = ["--settings", "width=4", "--crop", "16", "--frames", "2", "--batch", "1", "--validation-frames", "1"]
+    model = ["--model", "cascaded", "--settings", "width=4"]
+    small = [*model, "--crop", "16", "--frames", "2", "--batch", "1", "--validation-frames", "1"]
     command = ["train", small_sequence, "-o", tmp_path / "run", *small, "--steps", "2", "--checkpoint-every", "1"]
     status, text, errors = run(*command)
     assert status == 0
-    weights = tmp_path / "run" / "cascaded_v2.safetensors"
+    weights = tmp_path / "run" / "cascaded.safetensors"
     assert text == f"{weights}\n"
     # Without a terminal, rich prints no colors.
-    assert re.findall(r"^step (\d)  loss 0\.\d{4}  \d+ s  validation smape", errors, re.MULTILINE) == ["1", "2"]
+    assert re.findall(r"^step (\d)  loss \d\.\d{4}  \d+ s  validation smape", errors, re.MULTILINE) == ["1", "2"]
     assert run(*denoise, "--weights", weights)[0] == 0
 
 
@@ -461,6 +462,6 @@ def test_a_small_still_is_denoised_without_loading_the_compiler(tmp_path: Path) 
         "    print(sorted({'kornia', 'numba'} & set(sys.modules)))"
     )
     command = ["denoise", str(tmp_path / "frames"), "-o", str(tmp_path / "out")]
-    arguments = [*command, "--model", "cascaded_v2_micro", "--precision", "float32"]
+    arguments = [*command, "--model", "wild_small", "--precision", "float32"]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
     assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["[]"]), done.stderr

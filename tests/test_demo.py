@@ -29,9 +29,9 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     assert rendered[-1][0] == rendered[-1][1] == 3 + 2 * 64
     assert denoised == [0, 1, 2]
     scores = {score.method: score for score in result.scores}
-    assert list(scores) == ["noisy", "accumulated", "cascaded_v2, initial", "cascaded_v2"]
+    assert list(scores) == ["noisy", "accumulated", "wild"]
     assert all(score.frames == 2 for score in result.scores)
-    assert scores["cascaded_v2"].values["SMAPE"] < scores["accumulated"].values["SMAPE"]
+    assert scores["wild"].values["SMAPE"] < scores["accumulated"].values["SMAPE"]
     assert scores["accumulated"].values["SMAPE"] < scores["noisy"].values["SMAPE"]
     assert {path.name for path in result.denoised.iterdir()} == {
         "denoised0.exr",
@@ -45,7 +45,7 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     assert "demo" in found.command
     # The errors are those of the files that were written, up to their half precision.
     written = evaluate_folder(open_sequence(tmp_path / "sequence"), result.denoised).tables["strict"]
-    assert scores["cascaded_v2"].values["SMAPE"] == pytest.approx(written.mean["SMAPE"], rel=1e-3)
+    assert scores["wild"].values["SMAPE"] == pytest.approx(written.mean["SMAPE"], rel=1e-3)
     sheet = result.picture.read_bytes()
     assert sheet.startswith(b"\x89PNG")
 

@@ -101,11 +101,8 @@ def check(denoiser: Denoiser, frames: list[dict[str, Tensor]], names: tuple[str,
 
 # The larger one has enough pixels for compiled backends, which are chosen if no derivative is requested.
 @pytest.mark.parametrize("size", [(24, 40), (96, 96)], ids=str)
-@pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v2_tiny"])
-def test_derivative_of_the_third_frame_in_the_first(name: str, size: tuple[int, int]) -> None:
-    if size == (96, 96) and name != "cascaded_v2_micro":
-        pytest.skip("the forms of operators are those of the smallest model")
-    model = create_model(name, pretrained=True)
+def test_derivative_of_the_third_frame_in_the_first(size: tuple[int, int]) -> None:
+    model = create_model("wild_small", pretrained=True)
     assert isinstance(model, nn.Module)
     denoiser = Denoiser(model.double(), differentiable=True)
     sizes = check(denoiser, shot(size), ("color", "albedo", "normal"))
@@ -117,7 +114,7 @@ def test_derivative_of_the_third_frame_in_the_first(name: str, size: tuple[int, 
 
 
 def test_derivative_in_the_normals_of_the_same_frame() -> None:
-    model = create_model("cascaded_v2_micro", pretrained=True)
+    model = create_model("wild_small", pretrained=True)
     assert isinstance(model, nn.Module)
     sizes = check(Denoiser(model.double(), differentiable=True), shot((24, 40), 1)[:1], ("color", "albedo", "normal"))
     assert all(size > 0 for size in sizes.values())
@@ -127,7 +124,7 @@ def test_detach_ends_the_graph_and_changes_no_image() -> None:
     frames = [{name: buffer.float() for name, buffer in each.items()} for each in shot((24, 32), frames=2)]
     images = []
     for cut in (False, True):
-        denoiser = Denoiser("cascaded_v2_micro", differentiable=True)
+        denoiser = Denoiser("wild_small", differentiable=True)
         leaves = [each["color"].clone().requires_grad_() for each in frames]
         for frame, color in zip(frames, leaves, strict=True):
             image = denoiser(Frame(**{**frame, "color": color}))

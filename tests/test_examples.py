@@ -28,9 +28,9 @@ RENDERERS = Path(__file__).parent / "data" / "renderers"
 # Arguments of the examples that measure, which take long: each as small as it may be.
 MEASURING = {
     "start_up.py": "--size 64x48 --rounds 1 --threads 1 --quality fast --json {out}/times.json",
-    "training_speed.py": "{shot} --model cascaded_v2_micro --batch 1 --frames 2 --crop 16 --threads 1 --rounds 1",
+    "training_speed.py": "{shot} --model wild_small --batch 1 --frames 2 --crop 16 --threads 1 --rounds 1",
     "film_scale.py": "--nodes 2 --shots 1 --frames 2 --json {out}/scale.json",
-    "large_frames.py": "--sizes 64x48 --model cascaded_v2_micro --max-memory 2 --threads 1 --json {out}/costs.json",
+    "large_frames.py": "--sizes 64x48 --model wild_small --max-memory 2 --threads 1 --json {out}/costs.json",
 }
 
 
@@ -127,15 +127,15 @@ def test_unseen_scenes_sweeps_any_settings(small_sequence: Path, weights: Path) 
     lines = run("unseen_scenes.py", small_sequence, "--models", models, "--no-flip", "--frames", "0-2").splitlines()
     images = [line[15:].partition("  ")[0].strip() for line in lines[1:]]
     assert images[:2] == ["noisy", "accumulated"]
-    assert images[2:] == ["cascaded_v2, best of 2 settings", "small, initial", "small"]
+    assert images[2:] == ["cascaded, best of 2 settings", "small, initial", "small"]
 
 
 def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     file = tmp_path / "times.json"
-    models = ("accumulated", "cascaded_v2_tiny(alpha_min=0.2)", f"{EXAMPLES / 'compose_denoiser.py'}:method")
+    models = ("accumulated", "wild_small(alpha_min=0.2)", f"{EXAMPLES / 'compose_denoiser.py'}:method")
     arguments = ("--models", *models, "--size", "64x36", "--threads", "1", "--rounds", "2", "--json", file)
     lines = run("run_time.py", *arguments).splitlines()
-    tiny = "cascaded_v2_tiny(alpha_min=0.2)"
+    tiny = "wild_small(alpha_min=0.2)"
     names = ["accumulated", tiny, f"{tiny}, bfloat16", "compose_denoiser.py:method"]
     assert [line[:44].strip() for line in lines[2:]] == names
     assert lines[2].endswith(" 1.00")
@@ -239,7 +239,7 @@ def cells_of(text: str) -> list[list[str]]:
 
 
 def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:
-    lines = run("skipped.py", small_sequence, "--model", "cascaded_v2_tiny", "--frames", "4", "--markdown").splitlines()
+    lines = run("skipped.py", small_sequence, "--model", "wild_small", "--frames", "4", "--markdown").splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert rows[0][:3] == ["scene", "shot", "skipped"]
     shots = {row[1]: row for row in rows[2:]}
@@ -276,25 +276,25 @@ def test_mitsuba_denoiser_denoises_a_still_and_optimises_where_mitsuba_different
 @pytest.mark.slow
 def test_mitsuba_denoiser_is_measured_beside_plain_rendering() -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    small = ("--size", "32", "--samples", "1", "--rounds", "1", "--models", "cascaded_v2_micro")
+    small = ("--size", "32", "--samples", "1", "--rounds", "1", "--models", "wild_small")
     said = run("mitsuba_denoiser.py", "--measure", "32", *small)
     if "LLVM" in said:
         pytest.skip(said)
     steps = dict(re.findall(r"^\| 32 \| (.*?) \|.* ([\d.]+) \|$", said, re.MULTILINE))
-    assert list(steps) == ["rendering alone", "with `cascaded_v2_micro`"]
+    assert list(steps) == ["rendering alone", "with `wild_small`"]
     assert float(steps["rendering alone"]) == 1
     errors = {name: float(error) for name, error in re.findall(r"^\| (\S+) \| .* \| ([\d.]+) \|$", said, re.MULTILINE)}
-    assert errors["`cascaded_v2_micro`"] < errors["noisy"]
+    assert errors["`wild_small`"] < errors["noisy"]
 
 
 def test_layers_of_a_blender_shot_are_compared(tmp_path: Path) -> None:
     for path in (RENDERERS / "blender").iterdir():
         for name in (path.name, path.name.replace("shot", "reference")):
             shutil.copy(path, tmp_path / name)
-    title, *lines = run("layers.py", tmp_path, "cascaded_v2_micro").splitlines()
+    title, *lines = run("layers.py", tmp_path, "wild_small").splitlines()
     assert title.startswith("8 layers: ViewLayer.DiffDir, ")
     assert [line.split(" | ")[0] for line in lines[2:]] == [
-        "| `cascaded_v2_micro`, color alone",
+        "| `wild_small`, color alone",
         "| with layers",
         "| every layer by itself",
     ]

@@ -147,7 +147,7 @@ def test_a_users_model_is_exported_with_its_wrappers(mine: str, tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("name", ["cascaded_v2_micro", "cascaded_v3_micro", "oidn_tuned_small"])
+@pytest.mark.parametrize("name", ["wild_small"])
 @pytest.mark.timeout(1800)
 def test_models_of_the_zoo_are_exported(name: str, tmp_path: Path) -> None:
     model = create_model(name, pretrained=True)
@@ -166,7 +166,6 @@ def test_models_of_the_zoo_are_exported(name: str, tmp_path: Path) -> None:
     half = convert_float_to_float16(onnx.load(exported.path), keep_io_types=True, op_block_list=blocked)
     onnx.save(half, exported.path)
     for image, expected in zip(with_onnxruntime(exported, step, shot), eager(model, shot), strict=True):
-        # Measured: 0.0001 for cascaded_v2_micro, 0.024 for oidn_tuned_small, from its second frame on.
         assert (image - expected).abs().mean() < 0.05 * expected.mean()
 
 

@@ -11,7 +11,7 @@ from mcdenoise import Denoiser, Frame, InputError, denoise
 from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
 
 HEIGHT, WIDTH = 5, 7
-MODEL = "cascaded_v2_micro"
+MODEL = "wild_small"
 # Accumulated adds these buffers to a frame: no renderer writes them.
 OWN = {"current", "length"}
 

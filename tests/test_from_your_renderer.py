@@ -136,7 +136,7 @@ def test_commands_of_a_section_run(section: str, files: str, tmp_path: Path, mon
         program, *arguments = shlex.split(command)
         assert program == "mcdenoise"
         # The smallest model: what is tested here is files.
-        status, _, said = run(*arguments, *(["--model", "cascaded_v2_micro"] if arguments[0] == "denoise" else []))
+        status, _, said = run(*arguments, *(["--model", "wild_small"] if arguments[0] == "denoise" else []))
         assert status == 0, said
         assert "warning" not in said
     if section == "Blender":

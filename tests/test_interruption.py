@@ -180,7 +180,7 @@ def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
         images = [torch.rand(1, count, 90, 160) for count in (3, 3, 1)]
         write_bmfr_frame(tmp_path / "inputs", number, Frame(*images[:2], depth=1 + images[2]))
     for seconds, number in ((0.5, signal.SIGINT), (3.0, signal.SIGTERM)):
-        options = ("-o", tmp_path / "out", "--model", "cascaded_v2_micro")
+        options = ("-o", tmp_path / "out", "--model", "wild_small")
         process = started(OBEYING, "denoise", tmp_path / "inputs", *options, folder=tmp_path)
         assert process.stdout is not None
         process.stdout.readline()

@@ -26,7 +26,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "recipe.toml": lambda path: Recipe.read(path, ()),
     "results.json": lambda path: Results.read(path.parent),
     "weights.safetensors": describe_weights,
-    "given.safetensors": lambda path: create_model("cascaded_v2", weights=path),
+    "given.safetensors": lambda path: create_model("cascaded", weights=path),
     "model.safetensors": lambda path: parse_method(str(path)),
     "archive.tza": lambda path: create_model("oidn_open", archive=str(path)),
     "model.py": lambda path: load_own(f"{path}:model", "model", "factory"),

@@ -5,14 +5,13 @@ import torch
 from planes import HEIGHT, WIDTH, plane
 
 from mcdenoise.frame import Frame
-from mcdenoise.sampling import has_centred_features, has_exact_features, has_scattered_features
+from mcdenoise.sampling import has_centred_features, has_scattered_features
 
 CENTRED = plane()
 
 
 def test_a_plane_seen_through_the_centres() -> None:
     assert has_centred_features(CENTRED)
-    assert has_exact_features(CENTRED)
     # Files in half precision have such a depth.
     assert has_centred_features(CENTRED.replace(depth=CENTRED.depth.half().float()))
 
@@ -33,7 +32,6 @@ def test_normals_of_more_than_one_point() -> None:
 @pytest.mark.parametrize("missing", ["depth", "normal"])
 def test_without_depth_or_normal_the_answer_is_no(missing: str) -> None:
     assert not has_centred_features(CENTRED.replace(**{missing: None}))
-    assert not has_exact_features(CENTRED.replace(**{missing: None}))
 
 
 def test_normals_of_scattered_rays() -> None:
@@ -42,7 +40,6 @@ def test_normals_of_scattered_rays() -> None:
     specks = CENTRED.normal.clone()
     specks[..., 5::10, 5::10] *= -1
     assert has_scattered_features(CENTRED.replace(normal=specks))
-    assert not has_exact_features(CENTRED.replace(normal=specks))
     # The edges of an object in front have equal neighbours.
     edges = CENTRED.normal.clone()
     edges[..., 10:30, 20:50] *= -1

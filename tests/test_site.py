@@ -27,9 +27,9 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     pages = site("methods").pages()
     assert {f"methods/{name}.md" for name in list_models()} | {"methods/index.md"} == set(pages)
     assert all("## How it works" in text and "::: mcdenoise.models" in text for text in list(pages.values())[:-1])
-    own = pages["methods/cascaded_v2.md"]
+    own = pages["methods/oidn_temporal.md"]
     # The same figure as in the table that it is taken from.
-    assert "| cascaded_v2 | **0.06854** |" in own
+    assert "| oidn_temporal | **0.857** |" in own
     assert "| run time | " in own
     assert ":func:" not in "".join(pages.values())
 

@@ -12,12 +12,12 @@ from commands import succeeds
 from refusals import refused
 from torch import Tensor, nn
 
-from mcdenoise import Denoiser, Frame, create_model
+from mcdenoise import Denoiser, Frame, create_model, ops
 from mcdenoise.data import read_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 
 # A fast model with shipped weights.
-MODEL = "cascaded_v2_micro"
+MODEL = "wild_small"
 HEIGHT, WIDTH = 40, 72
 
 
@@ -98,7 +98,7 @@ def test_images_on_the_way_may_be_changed_where_they_are(shot: list[Frame]) -> N
     for frame, image in zip(shot, expected, strict=True):
         before = frame.color.clone()
         output = denoiser.output(frame)
-        assert list(output.stages) == ["noisy", "accumulated", "initial"]
+        assert list(output.stages) == ["noisy", "accumulated"]
         assert torch.equal(output.image, image)
         for one in (*output.stages.values(), output.image):
             one.fill_(1e6)
@@ -184,7 +184,7 @@ def test_the_largest_radiance_that_is_one_stays_finite(name: str, where: slice, 
         dark = None if albedo is None else torch.full_like(color, albedo)
         output = denoiser.output(frame.replace(color=color, albedo=dark))
         assert denoiser.report.replaced_pixels == 0
-        assert {"accumulated", "initial"} <= set(output.stages)
+        assert "accumulated" in output.stages
         for image in (*output.stages.values(), output.image):
             assert image.isfinite().all()
             assert image.max() <= 1.01e16
@@ -213,8 +213,10 @@ def run(sequence: Path, out: Path, frames: str) -> tuple[np.ndarray, str]:
 def test_motion_across_frames_that_were_not_chosen_is_not_followed(tmp_path: Path) -> None:
     for number in range(5):
         write_bmfr_frame(tmp_path / "motion" / "inputs", number, with_motion(number))
-    alone, _ = run(tmp_path / "motion", tmp_path / "alone", "4")
-    after_a_gap, why = run(tmp_path / "motion", tmp_path / "gap", "0-1,4")
+    # A still is computed in plain torch, whose rounding is not that of compiled steps.
+    with ops.use("torch"):
+        alone, _ = run(tmp_path / "motion", tmp_path / "alone", "4")
+        after_a_gap, why = run(tmp_path / "motion", tmp_path / "gap", "0-1,4")
     assert why
     assert np.array_equal(after_a_gap, alone)
     followed, why = run(tmp_path / "motion", tmp_path / "followed", "0-1,3-4")

@@ -32,7 +32,7 @@ def test_the_threads_of_commands_wait_without_spinning() -> None:
 def test_the_number_of_threads_is_the_users(small_sequence: Path, tmp_path: Path) -> None:
     """Also if it is larger than that of the cores."""
     environment, more = {**os.environ, "OMP_NUM_THREADS": "1"}, 2 * (os.cpu_count() or 1) + 1
-    command = [sys.executable, "-m", "mcdenoise", "denoise", str(small_sequence), "--model", "cascaded_v2_micro"]
+    command = [sys.executable, "-m", "mcdenoise", "denoise", str(small_sequence), "--model", "wild_small"]
     for expected, options in ((1, []), (more, ["--threads", str(more)])):
         out = tmp_path / str(expected)
         done = subprocess.run([*command, "-o", str(out), *options], env=environment, capture_output=True, text=True)

@@ -51,7 +51,7 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
 @pytest.mark.parametrize(
     ("model", "precision", "width", "height", "limit"),
-    [("cascaded_v2", "bfloat16", 7680, 4320, 4.0), ("cascaded_v2", "float32", 3840, 2160, 2.0)],
+    [("wild", "bfloat16", 7680, 4320, 4.0), ("wild", "float32", 3840, 2160, 2.0)],
 )
 def test_the_peak_of_memory_stays_below_the_limit(
     model: str, precision: str, width: int, height: int, limit: float, tmp_path: Path

@@ -1,6 +1,6 @@
 """Count the kernels that a step of a model launches on a GPU, by the page that asks for them; needs no GPU.
 
-    python examples/gpu/launches.py cascaded_v2
+    python examples/gpu/launches.py wild
 
 The step runs on tensors without values, whose operators are counted but for views and empty memory.
 """
@@ -15,6 +15,7 @@ from part import SIZES, shot
 from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from mcdenoise.models import DEFAULT
 from mcdenoise.ops import use
 
 PAGES = "/mcdenoise/models/"
@@ -55,6 +56,6 @@ def launches(name: str, size: tuple[int, int] = SIZES[0]) -> Counter[str]:
 
 
 if __name__ == "__main__":
-    for name in sys.argv[1:] or ["cascaded_v2"]:
+    for name in sys.argv[1:] or [DEFAULT]:
         found = launches(name)
         print(f"{name}: {found.total()} ({', '.join(f'{page} {count}' for page, count in found.most_common())})")

@@ -26,8 +26,8 @@ from mcdenoise.models._registry import find_model
 from mcdenoise.ops import use
 
 # In this order, the most important first; then all others.
-FIRST = (DEFAULT, "wild", "wild_small", "oidn_tuned_small", "oidn_tuned")
-COMPILED, STREAMING = (DEFAULT, "wild"), (DEFAULT, "oidn_tuned_small")
+FIRST = (DEFAULT, "wild_small", "wild_large")
+COMPILED = STREAMING = (DEFAULT, "wild_small")
 AGREEING = (320, 180)
 STREAMED = 60
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16, "float32": None}

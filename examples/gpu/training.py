@@ -22,7 +22,7 @@ from mcdenoise.models._precision import Precision
 sys.path.append(str(Path(__file__).parents[1]))
 from training_speed import config_of, noise, steps
 
-SMALLEST = "cascaded_v2_micro"
+SMALLEST = "wild_small"
 
 
 def steps_of(model: str, device: str, precision: Precision, crop: int, batch: int) -> Callable[[], float]:
@@ -52,7 +52,7 @@ def main() -> None:
     part = Part.begin(__doc__)
     torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     part.attempt("losses", partial(compared, part))
-    models, crop = ((SMALLEST,), 32) if part.quick else ((DEFAULT, "oidn_tuned", SMALLEST), 128)
+    models, crop = ((SMALLEST,), 32) if part.quick else ((DEFAULT, SMALLEST), 128)
     for precision in ("bfloat16", "float32"):
         for model in models:
             for batch in (2,) if part.quick else (4, 16):

@@ -16,15 +16,13 @@ from pathlib import Path
 from torch import nn
 
 from mcdenoise.data.files import atomic_path
-from mcdenoise.denoiser import FILTERED
 from mcdenoise.export import export_model
 from mcdenoise.frame import Frame
-from mcdenoise.models import Needs, Output, State, create_model
+from mcdenoise.models import DEFAULT, Needs, Output, State, create_model
 from mcdenoise.models._layers import fractions
 
 HERE = Path(__file__).parent
-# The model that the command picks for the frames of a renderer.
-MODEL, BUFFERS = FILTERED, ("color", "albedo", "normal", "depth", "motion")
+BUFFERS = ("color", "albedo", "normal", "depth", "motion")
 WHEEL, PYTHON = "onnxruntime==1.22.0", "3.11"
 PLATFORMS = {("Linux", "x86_64"): "linux-x64", ("Windows", "AMD64"): "windows-x64", ("Darwin", "arm64"): "macos-arm64"}
 
@@ -48,7 +46,7 @@ def main() -> None:
     """Build the zip that the arguments name."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True, help="the zip to write")
-    parser.add_argument("--model", default=MODEL, help="a model with shipped weights, see `mcdenoise models`")
+    parser.add_argument("--model", default=DEFAULT, help="a model with shipped weights, see `mcdenoise models`")
     asked = parser.parse_args()
     here = (platform.system(), platform.machine())
     if here not in PLATFORMS:

@@ -92,7 +92,7 @@ def test_weights_of_ones_own_model_are_loaded_with_its_factory(here: Path, small
     (here / "folder").mkdir()
     (here / "folder/own.py").write_text(
         "from mcdenoise.models import create_model\n\n\ndef make(width=4):\n"
-        "    return create_model('cascaded_v2_micro', width=width)\n"
+        "    return create_model('cascaded', width=width)\n"
     )
     name = f"{here}/folder/own.py:make"
     file = here / "make.safetensors"

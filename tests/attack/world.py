@@ -23,11 +23,11 @@ from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.train import Progress, TrainConfig, train
 
 WIDTH, HEIGHT, FRAMES = 16, 12, 2
-MODEL = "cascaded_v2_micro"
+MODEL = "wild_small"
 
 RECIPE = """\
 [train]
-model = "cascaded_v2_micro"
+model = "wild_small"
 steps = 3
 frames = 2
 crop = 64

@@ -52,7 +52,7 @@ def test_frames_of_acescg_are_denoised_in_it_and_come_back_in_it(
     shown = []
     for root in (small_sequence, wide):
         out = tmp_path / f"clean_{root.name}"
-        denoise_sequence(open_sequence(root), out, Denoiser("cascaded_v2_micro"), "cascaded_v2_micro")
+        denoise_sequence(open_sequence(root), out, Denoiser("wild_small"), "wild_small")
         pixels, _, metadata = read_exr(out / "denoised3.exr")
         assert ("chromaticities" in metadata) == (root == wide)
         shown.append(to_rec709(torch.from_numpy(pixels[..., :3]).permute(2, 0, 1)[None], metadata))

@@ -27,7 +27,7 @@ def write_benchmark(root: Path) -> None:
     """Write a benchmark with a missing method, one that failed on the second scene, and one with a hostile name."""
     methods = [
         Method("noisy", "baseline", "noisy", "noisy"),
-        Method("ours", "trainable", "ours", "cascaded_v2", parameters=1234),
+        Method("ours", "trainable", "ours", "wild", parameters=1234),
         Method(HOSTILE, "fixed", "hostile", "oidn"),
         Method("fails", "fixed", "fails", "other"),
         Method("absent", "fixed", "absent", "absent", missing="the package <absent> is not installed"),

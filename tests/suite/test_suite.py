@@ -134,7 +134,7 @@ def _results(ours: list[float], fast: list[float], high: list[float]) -> tuple[R
     ]
     methods = [
         Method("noisy", "baseline", "noisy", "noisy"),
-        Method("ours", "trainable", "ours", "cascaded_v2"),
+        Method("ours", "trainable", "ours", "wild"),
         Method("oidn(quality=fast)", "fixed", "fast", "oidn", {"quality": "fast"}),
         Method("oidn(quality=high)", "fixed", "high", "oidn", {"quality": "high"}),
     ]
@@ -219,10 +219,10 @@ def test_the_command_scores_the_existing_rows(
     status, said, message = run(
         "benchmark",
         *("--suite", "wild", "--data", tmp_path / "data", "--no-render", "-o", out, "--threads", 1),
-        *("--models", "cascaded_v2_micro,oidn(quality=fast)", "--json", tmp_path / "suite.json"),
+        *("--models", "wild_small,oidn(quality=fast)", "--json", tmp_path / "suite.json"),
     )
     assert status == 0, message
-    assert "## cascaded_v2_micro" in said
+    assert "## wild_small" in said
     assert "not rendered: absent" in said
     text = (out / "suite.md").read_text()
     assert text in said
