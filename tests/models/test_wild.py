@@ -91,8 +91,8 @@ def test_every_pixel_of_a_block_has_its_own_prediction() -> None:
 @has_oidn
 def test_it_starts_as_the_library() -> None:
     model: Any = create_model("wild")
-    library = create_model("oidn_open", quality="fast")
-    assert len(start_with(model, "oidn_open", quality="fast")) == 64
+    library = create_model("oidn_open", quality="balanced")
+    assert len(start_with(model, "oidn_open", quality="balanced")) == 64
     frame = frame_of(48, 64)
     with torch.no_grad():
         image, expected = model.eval()(frame)[0].image, library(frame)[0].image
