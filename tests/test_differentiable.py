@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from mcdenoise import Denoiser, Frame, create_model
 
-# Central differences of smooth functions in float64: rounding is 1e-16 / 1e-6 of the value, truncation 1e-12.
-STEP, TOLERANCE = 1e-6, 1e-6
+# Central differences in float64: rounding is 1e-16 / 1e-7 of the value, truncation 1e-14; few kinks are that near.
+STEP, TOLERANCE = 1e-7, 1e-6
 COMPILED = ("mcdenoise.ops._fast", "mcdenoise.ops._numba", "torch")
 
 

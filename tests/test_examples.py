@@ -91,7 +91,8 @@ def test_a_method_composed_of_two_learns(small_sequence: Path) -> None:
 
 def test_denoise_sequence_writes_every_frame(small_sequence: Path, weights: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    printed = run("denoise_sequence.py", small_sequence, out, "--weights", weights, "--device", "cpu")
+    own = ("--model", "cascaded", "--weights", weights)
+    printed = run("denoise_sequence.py", small_sequence, out, *own, "--device", "cpu")
     assert "(first frame)" in printed.splitlines()[0]
     assert sorted(path.name for path in out.iterdir()) == [*(f"denoised{i}.exr" for i in range(4)), "last.png"]
     pixels, channels, _ = read_exr(out / "denoised3.exr")
