@@ -3,8 +3,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
+COMPARED := "oidn(quality=fast,auxiliary=noisy)" "oidn(quality=balanced,auxiliary=noisy)" \
+  "oidn(auxiliary=prefiltered)" oidn_temporal wild_small wild wild_large
+
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs blender lint format clean
+.PHONY: help demo test docs figures blender lint format clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -20,6 +23,12 @@ test: $(VENV)/.stamp-dev ## run every test that is not marked slow or attack, on
 docs: $(VENV)/.stamp-fast,oidn,docs ## build the documentation as a site that opens from disk: build/site/index.html
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=0 $(BIN)/mkdocs build --quiet
 	@echo "build/site/index.html"
+
+figures: $(VENV)/.stamp-fast,render,peers,report ## measure anew what the documentation says of error and run time; takes an hour
+	$(BIN)/mcdenoise generate --takes --unseen --seeds 900016-900031 -o build/figures/takes
+	$(BIN)/python examples/takes.py build/figures/takes --clean build/figures/clean --models $(COMPARED) --json benchmarks/takes.json
+	$(BIN)/python examples/run_time.py --threads 2 --rounds 5 --models $(COMPARED) --json benchmarks/run-time.json
+	$(BIN)/python examples/figures.py benchmarks
 
 blender: $(VENV)/.stamp-export ## build the extension for Blender: build/mcdenoise-blender.zip
 	$(BIN)/python extensions/blender/build.py -o build/mcdenoise-blender.zip

@@ -1,0 +1,172 @@
+"""Write the tables and the plot of the documentation from measured figures.
+
+    make figures
+    python examples/figures.py benchmarks --pages .
+    python examples/figures.py benchmarks --pages . --check
+
+`make figures` measures first: errors on unseen takes (takes.py) and run times on one frame (run_time.py), each in one
+run. A table stands in a page between ``<!-- figures: NAME -->`` and ``<!-- end of figures -->``. With --check nothing
+is written, and pages that differ from the figures are an error.
+"""
+
+import argparse
+import json
+import re
+import statistics
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from takes import OIDN, mean
+
+from mcdenoise.data.files import write_text
+from mcdenoise.errors import InputError
+from mcdenoise.reading import read_text
+
+METHODS = {
+    "oidn(quality=fast,auxiliary=noisy)": "OIDN fast",
+    "oidn(quality=balanced,auxiliary=noisy)": "OIDN balanced",
+    "oidn(auxiliary=prefiltered)": "OIDN high, features denoised first",
+    "oidn_temporal": "`oidn_temporal`",
+    "wild_small": "`wild_small`",
+    "wild": "`wild`",
+    "wild_large": "`wild_large`",
+}
+PAGES = ("README.md", "docs/results.md", "docs/performance.md")
+PLOT = Path("docs/error_and_time.svg")
+_TICKS, _MIDDLE = (100, 300, 1000, 3000, 10000), 1000
+_BETWEEN = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
+
+
+class Errors(NamedTuple):
+    """Geometric means, and the worst, of errors over those of Open Image Denoise's better setting of each take."""
+
+    shots: float
+    worst_shot: float
+    flicker: float
+    stills: float
+    worst_still: float
+
+
+def errors_of(takes: dict[str, Any], name: str) -> Errors:
+    """The errors of a method."""
+    found: dict[tuple[str, bool], list[float]] = {}
+    for row in takes.values():
+        for key in row[name]:
+            if key in ("smape", "tsmape"):
+                best = min(row[each][key] for each in OIDN)
+                found.setdefault((key, "tsmape" in row[name]), []).append(row[name][key] / best)
+    shots, stills = found["smape", True], found["smape", False]
+    return Errors(mean(shots), max(shots), mean(found["tsmape", True]), mean(stills), max(stills))
+
+
+def milliseconds(times: dict[str, list[float]], name: str) -> dict[str, float]:
+    """Medians, by precision."""
+    kinds = {"float32": times.get(name), "bfloat16": times.get(f"{name}, bfloat16")}
+    return {kind: statistics.median(values) for kind, values in kinds.items() if values}
+
+
+def lines(rows: Iterable[list[str]], heads: list[str]) -> str:
+    """A table whose first column is text."""
+    head = [heads, ["---", *["--:"] * (len(heads) - 1)]]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [*head, *rows]) + "\n"
+
+
+def table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+    """Error and run time of all methods."""
+    found = {name: (errors_of(takes, name), min(milliseconds(times, name).values())) for name in METHODS}
+    least = [min(column) for column in zip(*(errors for errors, _ in found.values()), strict=True)]
+
+    def cells(errors: Errors) -> list[str]:
+        texts = [f"{value:.2f}" for value in errors]
+        return [f"**{text}**" if value == low else text for text, value, low in zip(texts, errors, least, strict=True)]
+
+    rows = [[METHODS[name], *cells(errors), f"{time:.0f}"] for name, (errors, time) in found.items()]
+    return lines(rows, ["", "shots: error", "worst", "flicker", "stills: error", "worst", "ms"])
+
+
+def time_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+    """Run times in both precisions."""
+    found = {name: milliseconds(times, name) for name in METHODS}
+    unit = found[next(iter(METHODS))]["float32"]
+    rows = [
+        [
+            METHODS[name],
+            *(f"{each[kind]:.0f}" if kind in each else "" for kind in ("float32", "bfloat16")),
+            f"{min(each.values()) / unit:.2f}",
+        ]
+        for name, each in found.items()
+    ]
+    return lines(rows, ["method", "float32, ms", "bfloat16, ms", "over OIDN fast"])
+
+
+def single_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+    """Every take: SMAPE of each method."""
+    del times
+    rows = []
+    for number, row in sorted(takes.items()):
+        values = [row[name]["smape"] for name in METHODS]
+        texts = [f"**{value:.4f}**" if value == min(values) else f"{value:.4f}" for value in values]
+        rows.append([f"{number}, {'shot' if 'tsmape' in row[OIDN[0]] else 'still'}", *texts])
+    return lines(rows, ["take", *METHODS.values()])
+
+
+TABLES: dict[str, Callable[[dict[str, Any], dict[str, list[float]]], str]] = {
+    "errors": table,
+    "times": time_table,
+    "takes": single_table,
+}
+
+
+def plot(takes: dict[str, Any], times: dict[str, list[float]], path: Path) -> None:
+    """Error over run time, of shots and of stills."""
+    from matplotlib.figure import Figure
+
+    from mcdenoise.report.plots import plot_style, write_figure
+
+    with plot_style():
+        figure = Figure((8, 3.6), layout="constrained")
+        for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("shots", "stills"), strict=True):
+            for name, label in METHODS.items():
+                time, error = min(milliseconds(times, name).values()), getattr(errors_of(takes, name), kind)
+                color = "#0072b2" if name.startswith("wild") else "#d55e00"
+                axes.plot(time, error, "o" if name.startswith("wild") else "s", color=color)
+                side = "right" if time > _MIDDLE else "left"
+                place = (-6 if side == "right" else 6, 4)
+                text = label.strip("`").partition(",")[0]
+                axes.annotate(text, (time, error), place, textcoords="offset points", ha=side, fontsize=8)
+            axes.set(title=kind, xscale="log", xlabel="ms for 1280x720")
+            axes.set_xticks(_TICKS, [str(tick) for tick in _TICKS])
+            axes.minorticks_off()
+            axes.axhline(1, color="#767676", linewidth=0.7)
+        figure.axes[0].set_ylabel("SMAPE over OIDN's best setting")
+        write_figure(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("figures", type=Path, metavar="FOLDER", help="with takes.json and run-time.json")
+    parser.add_argument("--pages", type=Path, default=Path(), metavar="FOLDER", help="where README.md and docs are")
+    parser.add_argument("--check", action="store_true", help="only compare the pages with the figures")
+    options = parser.parse_args()
+    takes = json.loads(read_text(options.figures / "takes.json"))
+    times = json.loads(read_text(options.figures / "run-time.json"))["milliseconds"]
+    times = {name.replace(", auxiliary", ",auxiliary"): values for name, values in times.items()}
+    for name in PAGES:
+        before = read_text(options.pages / name)
+        after = _BETWEEN.sub(lambda found: found[1] + TABLES[found[2]](takes, times) + found[3], before)
+        if options.check and after != before:
+            raise InputError(f"{name}: expected the tables of {options.figures}, found others; run make figures")
+        if after != before:
+            write_text(options.pages / name, after)
+    if not options.check:
+        plot(takes, times, options.pages / PLOT)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
