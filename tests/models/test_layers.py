@@ -202,7 +202,7 @@ def _modules(model: Any) -> list[Any]:
 
 def test_any_parts_of_the_color_may_be_asked_for() -> None:
     """A layer does not depend on which others are asked for with it."""
-    every, some = Denoiser(cascade()), Denoiser(cascade())
+    every, some = Denoiser(small("kp")), Denoiser(small("kp"))
     for frame in shot(every.model):
         expected = every.output(frame)
         found = some.output(with_layers(frame, glossy=frame.layers["glossy"]))

@@ -596,8 +596,7 @@ def test_a_layer_of_another_shape_is_named(weights: Path) -> None:
     settings = json.dumps(describe_weights(weights)["settings"] | {"width": 6})
     path = altered(weights, lambda tensors, header: header.update(settings=settings))
     message = refused(lambda: load_weights(path))
-    layer = "layer 'initial.unet.encoder.0.0.weight'"
-    assert f"{layer}: model 'cascaded' expects (6, 10, 3, 3), found (8, 10, 3, 3)" in message
+    assert "layer 'final.heads.0.weight': model 'cascaded' expects (28, 6, 3, 3), found (28, 8, 3, 3)" in message
 
 
 @pytest.mark.parametrize(
