@@ -109,8 +109,8 @@ class Tiles:
     def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor]:
         """Draw single frames as a batch, and their references."""
         rand = torch.rand(8, clips, device=self.device)
-        # As often as it has frames.
-        drawn = torch.multinomial(self.table[:, 2].float(), clips, replacement=True)
+        # Stills as often as shots, which have more frames.
+        drawn = torch.randint(len(self.table), (clips,), device=self.device)
         first, begun, frames, histories = self.table[drawn].unbind(1)
         t = (rand[0] * frames).long()
         when, which = first + t, begun + (rand[1] * histories).long() * frames + t
