@@ -49,7 +49,7 @@ LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least tha
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
-YOUNG = 0.25  # probability that a frame has no history
+YOUNG = 0.35  # probability that a frame has no history
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 
@@ -109,8 +109,8 @@ class Tiles:
     def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor]:
         """Draw single frames as a batch, and their references."""
         rand = torch.rand(8, clips, device=self.device)
-        # Stills as often as shots, which have more frames.
-        drawn = torch.randint(len(self.table), (clips,), device=self.device)
+        # As often as it has frames.
+        drawn = torch.multinomial(self.table[:, 2].float(), clips, replacement=True)
         first, begun, frames, histories = self.table[drawn].unbind(1)
         t = (rand[0] * frames).long()
         when, which = first + t, begun + (rand[1] * histories).long() * frames + t
