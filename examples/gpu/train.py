@@ -283,7 +283,8 @@ class Run:
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write the averaged weights."""
         commits = [{"first_step": 0, "commit": source_commit()}]
-        about = about_weights(asdict(self.config), identity | {"initial_weights": self.start}, self.steps, commits)
+        config = asdict(replace(self.config, steps=self.steps))
+        about = about_weights(config, identity | {"initial_weights": self.start}, self.steps, commits)
         with atomic_path(path) as temporary:
             temporary.write_bytes(save_weights(self.average, self.config.model, self.settings, about))
 
