@@ -301,7 +301,7 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
         )
     message = refused(lambda: Denoiser("wild", tolerence=torch.zeros(9, 9)))
     assert message == (
-        "argument 'tolerence': expected an argument of Denoiser or a setting of model 'wild' (size, stem, alpha_min, "
+        "argument 'tolerence': expected an argument of Denoiser or a setting of model 'wild' (size, alpha_min, "
         "anti_lag, tolerance), found none of this name; did you mean tolerance?"
     )
     assert refused(lambda: Denoiser(Keep(), width=8)) == "width: expected a model's name, found a model"

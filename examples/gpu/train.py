@@ -49,7 +49,7 @@ LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least tha
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
-YOUNG = 0.25  # probability that a frame has no history
+YOUNG = 0.35  # probability that a frame has no history
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 
@@ -283,7 +283,8 @@ class Run:
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write the averaged weights."""
         commits = [{"first_step": 0, "commit": source_commit()}]
-        about = about_weights(asdict(self.config), identity | {"initial_weights": self.start}, self.steps, commits)
+        config = asdict(replace(self.config, steps=self.steps))
+        about = about_weights(config, identity | {"initial_weights": self.start}, self.steps, commits)
         with atomic_path(path) as temporary:
             temporary.write_bytes(save_weights(self.average, self.config.model, self.settings, about))
 

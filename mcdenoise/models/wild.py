@@ -17,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
@@ -110,19 +109,11 @@ class WildNetwork(nn.Module):
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
-        stem: side of the blocks of pixels that the layers see as one, 1 or more. The layers see the mean of a block, as
-            if it was a pixel of a smaller image, and how its pixels differ from the last one.
-
-    Raises:
-        InputError: ``stem`` is below 1.
     """
 
-    def __init__(self, size: Size = "base", stem: int = 1) -> None:
+    def __init__(self, size: Size = "base") -> None:
         super().__init__()
-        if stem < 1:
-            raise InputError(f"stem: expected at least 1, found {stem}")
-        self.stem, blocks = stem, stem * stem
-        self.unet = OidnUNet(_CHANNELS * blocks, size, out_channels=(3 + len(_LOGITS)) * blocks)
+        self.unet = OidnUNet(_CHANNELS, size, out_channels=3 + len(_LOGITS))
         self.trust = Trust()
         # With random weights, the result first is the radiance that was given; other weights come with their own.
         last = self.unet.last
@@ -132,8 +123,7 @@ class WildNetwork(nn.Module):
             last.weight[3:].div_(_PACE)
             last.bias.zero_()[3].fill_(_LITTLE / _PACE)
         uses, unet = frozenset({"current", "length", "albedo", "normal"}), self.unet
-        reach = stem * unet.reach + Trust.reach
-        self.needs = Needs(uses=uses, reach=reach, stride=stem * unet.multiple, live=unet.live)
+        self.needs = Needs(uses=uses, reach=unet.reach + Trust.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
@@ -151,23 +141,10 @@ class WildNetwork(nn.Module):
             shown = (compress(image * exposure) for image in (alone, history))
             mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
         seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
-        image, logits = corner(self._predicted(seen), *frame.size).split([3, len(_LOGITS)], 1)
+        image, logits = corner(self.unet(seen), *frame.size).split([3, len(_LOGITS)], 1)
         predicted = torch.cat([image, _PACE * logits], 1)
         image = wild_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image if albedo is None else demodulate(image, albedo)), None
-
-    def _predicted(self, seen: Tensor) -> Tensor:
-        """Image and logits for ``(B, 16, H, W)``."""
-        if self.stem == 1:
-            return self.unet(seen)  # type: ignore[no-any-return]
-        # The first channels are those that the library's weights are for.
-        mean = F.avg_pool2d(seen, self.stem)
-        pixels = F.pixel_unshuffle(seen, self.stem).unflatten(1, (_CHANNELS, -1))
-        rest = (pixels[:, :, :-1] - pixels[:, :, -1:]).transpose(1, 2).flatten(1, 2)
-        shared, own = self.unet(torch.cat([mean, rest], 1)).split([3 + len(_LOGITS), rest.shape[1] // _CHANNELS * 7], 1)
-        own = own.unflatten(1, (-1, shared.shape[1])).transpose(1, 2)
-        blocks = shared[:, :, None] + torch.cat([own, torch.zeros_like(own[:, :, :1])], 2)
-        return F.pixel_shuffle(blocks.flatten(1, 2), self.stem)
 
 
 def _lit(frame: Frame, image: Tensor) -> Tensor:
@@ -176,7 +153,6 @@ def _lit(frame: Frame, image: Tensor) -> Tensor:
 
 def _wild(
     size: Size = "base",
-    stem: int = 1,
     *,
     alpha_min: float = 0.03,
     anti_lag: bool = True,
@@ -186,7 +162,6 @@ def _wild(
 
     Args:
         size: see :class:`WildNetwork`.
-        stem: see :class:`WildNetwork`.
         alpha_min: smallest weight of a frame in the accumulated radiance, see :class:`mcdenoise.models.Accumulated`.
         anti_lag: whether the history is shortened where the light has changed, see :func:`mcdenoise.ops.history_lag`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
@@ -194,7 +169,7 @@ def _wild(
     Raises:
         InputError: a setting is out of its range.
     """
-    model = Skipping(Tiled(WildNetwork(size, stem)), tolerance, alpha_min)
+    model = Skipping(Tiled(WildNetwork(size)), tolerance, alpha_min)
     threshold = THRESHOLD if anti_lag else math.inf
     # Clamped fireflies are light that the network would have to guess: stills had a tenth more error.
     return Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
@@ -205,7 +180,7 @@ register_family(
     "one network for sequences and stills, that sees the accumulated radiance",
     {
         "wild": ("with 125 thousand multiplications a pixel", {}),
-        "wild_small": ("at half resolution, with 16 thousand", {"size": "small", "stem": 2}),
+        "wild_small": ("with 62 thousand", {"size": "small"}),
         "wild_large": ("with 312 thousand", {"size": "large"}),
     },
     kind="recurrent",
