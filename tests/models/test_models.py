@@ -548,14 +548,14 @@ def test_a_text_is_no_truth_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"), [("wild_small", {}), ("wild_small", {"stem": 3}), ("wild", {"size": "small", "stem": 2})]
+    ("name", "settings"), [("wild_small", {}), ("wild", {"size": "small"})]
 )
 def test_settings_are_saved_and_loaded(name: str, settings: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "weights.safetensors"
     torch.manual_seed(0)
     model = create_model(name, **settings)
     path.write_bytes(save_weights(model, name, settings, {}))
-    assert describe_weights(path)["settings"] == {"size": "small", "stem": 2} | settings
+    assert describe_weights(path)["settings"] == {"size": "small"}
     for loaded in (load_weights(path), create_model(name, weights=path)):
         state = loaded.state_dict()
         assert list(state) == list(model.state_dict())
@@ -631,7 +631,7 @@ def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
     for settings, found in (({"quality": "high"}, "quality=high"), ({"size": "small"}, "size=small")):
         message = refused(lambda settings=settings: create_model("wild", pretrained=True, **settings))
         assert message == (
-            f"{beside}{found}; the weights fix size, stem; for other values train it, or take another model: "
+            f"{beside}{found}; the weights fix size; for other values train it, or take another model: "
             "wild_large, wild_small"
         )
     create_model("wild", pretrained=True, size="base")

@@ -77,16 +77,6 @@ def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
     assert not torch.allclose(weight(flat + noise), weight(flat + 0.1))
 
 
-def test_every_pixel_of_a_block_has_its_own_prediction() -> None:
-    torch.manual_seed(0)
-    model = WildNetwork(stem=2).double().eval()
-    seen = torch.rand(1, 16, 32, 32, dtype=torch.float64)
-    predicted = model._predicted(seen)
-    assert predicted.shape == (1, 7, 32, 32)
-    blocks = torch.nn.functional.pixel_unshuffle(predicted, 2).unflatten(1, (7, 4))
-    assert (blocks.std(2) > 0).all()
-
-
 @has_oidn
 def test_it_starts_as_the_library() -> None:
     model: Any = create_model("wild")

@@ -28,7 +28,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "oidn_temporal": {"auxiliary": "clean", "engine": "none", "prefilter": "none", "history": 0.0},
     "sbmc": {"width": 0, "rounds": 0, "convolutions": 0, "kernel_size": 0},
     "svgf": {"alpha": 0.0},
-    "wild": {"stem": 0, "alpha_min": 0, "tolerance": -1},
+    "wild": {"alpha_min": 0, "tolerance": -1},
     "wskp": {"layers": 1},
 }
 
