@@ -28,8 +28,11 @@ def test_every_method_has_a_page_with_its_cost_and_its_settings(site) -> None:
     assert {f"methods/{name}.md" for name in list_models()} | {"methods/index.md"} == set(pages)
     assert all("## How it works" in text and "::: mcdenoise.models" in text for text in list(pages.values())[:-1])
     own = pages["methods/oidn_temporal.md"]
-    # The same figure as in the table that it is taken from.
-    assert "| oidn_temporal | **0.857** |" in own
+    # The same row as in the table that it is taken from.
+    rows = [
+        line for line in (ROOT / "docs" / "results.md").read_text("utf-8").splitlines() if "`oidn_temporal` |" in line
+    ]
+    assert any(line in own for line in rows)
     assert "| run time | " in own
     assert ":func:" not in "".join(pages.values())
 

@@ -34,9 +34,8 @@ WEIGHTS = {
 }
 # How the tables of measurements call some methods.
 NAMES = {
-    "joint bilateral, best of 20 settings": "joint_bilateral",
     "OIDN": "oidn",
-    "OIDN, best of 36 settings": "oidn",
+    "OIDN high, features denoised first": "oidn",
 }
 PAPER = "*The paper* is [doi:10.1007/s00371-023-02951-6](https://doi.org/10.1007/s00371-023-02951-6)."
 MEASURED = ("results.md", "performance.md", "zoo.md", "layers.md")
