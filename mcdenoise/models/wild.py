@@ -208,7 +208,7 @@ register_family(
     "one network for sequences and stills, that sees the accumulated radiance",
     {
         "wild": ("with 125 thousand multiplications a pixel", {}),
-        "wild_small": ("at half resolution, with 16 thousand", {"size": "small", "stem": 2}),
+        "wild_small": ("with 62 thousand", {"size": "small"}),
         "wild_large": ("with 312 thousand", {"size": "large"}),
     },
     kind="recurrent",
