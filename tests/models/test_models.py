@@ -547,9 +547,7 @@ def test_a_text_is_no_truth_value() -> None:
     assert parse_method("mine.py:make(this=false, that=TRUE)").settings == {"this": False, "that": True}
 
 
-@pytest.mark.parametrize(
-    ("name", "settings"), [("wild_small", {}), ("wild", {"size": "small"})]
-)
+@pytest.mark.parametrize(("name", "settings"), [("wild_small", {}), ("wild", {"size": "small"})])
 def test_settings_are_saved_and_loaded(name: str, settings: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "weights.safetensors"
     torch.manual_seed(0)
