@@ -69,7 +69,7 @@ def wild_choice(predicted: Tensor, images: Tensor, part: Tensor, exposure: Tenso
     share = torch.cat([torch.ones_like(part), part, part, torch.ones_like(part)], 1)
     # The largest logit of a choice that counts: beside a larger one all weights might be 0.
     most = torch.where(share > 0, logits, -torch.inf).amax(1, keepdim=True).detach()
-    weights = share * (logits - most).clamp_max(0).exp()
+    weights = share * torch.where(share > 0, logits - most, 0).exp()
     choices = torch.stack([own.clamp_min(0), alone, history, mean], 1)
     mixed = (weights[:, :, None] * choices).sum(1) / weights.sum(1, keepdim=True)
     return expand(mixed) / exposure
