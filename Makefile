@@ -28,7 +28,7 @@ figures: $(VENV)/.stamp-fast,render,peers,report ## measure anew what the docume
 	$(BIN)/mcdenoise generate --takes --unseen --seeds 900016-900031 -o build/figures/takes
 	$(BIN)/python examples/takes.py build/figures/takes --clean build/figures/clean --models $(COMPARED) --json benchmarks/takes.json
 	$(BIN)/python examples/run_time.py --threads 2 --rounds 5 --models $(COMPARED) --json benchmarks/run-time.json
-	$(BIN)/python examples/figures.py benchmarks
+	$(BIN)/python examples/write_tables.py benchmarks
 
 blender: $(VENV)/.stamp-export ## build the extension for Blender: build/mcdenoise-blender.zip
 	$(BIN)/python extensions/blender/build.py -o build/mcdenoise-blender.zip

@@ -16,13 +16,13 @@ EXAMPLES = ROOT / "examples"
 @pytest.fixture
 def figures(monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    import figures
+    import write_tables
 
-    return figures
+    return write_tables
 
 
 def run(figures, monkeypatch, *arguments: str) -> None:
-    monkeypatch.setattr(sys, "argv", ["figures.py", *arguments])
+    monkeypatch.setattr(sys, "argv", ["write_tables.py", *arguments])
     figures.main()
 
 

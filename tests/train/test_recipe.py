@@ -179,7 +179,7 @@ steps = 2
     assert sorted(path.name for path in out.iterdir()) == ["K-5", "cache", "other-loss"]
     assert renderings(trained / "data") == before
     config = json.loads((out / "other-loss" / "config.json").read_text())
-    assert (config["loss"], config["steps"], config["settings"]) == ("l1_display", 2, "width=8")
+    assert (config["loss"], config["steps"], config["settings"]) == ("l1_display", 2, "")
     about = describe_weights(out / "K-5" / "cascaded.safetensors")
     assert (about["settings"]["cascade"], json.loads((out / "K-5" / "config.json").read_text())["seed"]) == ("K", 5)
     # The expected error is printed for the run that has one.

@@ -1,8 +1,8 @@
 """Write the tables and the plot of the documentation from measured figures.
 
     make figures
-    python examples/figures.py benchmarks --pages .
-    python examples/figures.py benchmarks --pages . --check
+    python examples/write_tables.py benchmarks --pages .
+    python examples/write_tables.py benchmarks --pages . --check
 
 `make figures` measures first: errors on unseen takes (takes.py) and run times on one frame (run_time.py), each in one
 run. A table stands in a page between ``<!-- figures: NAME -->`` and ``<!-- end of figures -->``. With --check nothing
