@@ -15,6 +15,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -30,6 +31,8 @@ from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
 from mcdenoise.train.packed import frame_of
 
+# Errors by take, method and metric.
+Rows: TypeAlias = dict[str, dict[str, dict[str, float]]]
 OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=prefiltered)")
 
 
@@ -55,23 +58,31 @@ def mean(values: Iterable[float]) -> float:
     return math.exp(sum(logs) / len(logs))
 
 
-def table(rows: dict[str, dict[str, dict[str, float]]], models: list[str], moving: bool) -> Iterable[str]:
+def rows_of(rows: Rows, *, moving: bool) -> list[dict[str, dict[str, float]]]:
+    """The rows of shots, or of stills, which have no error of change."""
+    return [row for row in rows.values() if ("tsmape" in row[OIDN[0]]) == moving]
+
+
+def ratios(rows: Rows, name: str, key: str, *, moving: bool) -> list[float]:
+    """A method's errors of shots, or of stills, over those of Open Image Denoise's better setting of each take."""
+    return [row[name][key] / min(row[each][key] for each in OIDN) for row in rows_of(rows, moving=moving)]
+
+
+def table(rows: Rows, models: list[str], moving: bool) -> Iterable[str]:
     """Lines of a table: each method beside Open Image Denoise's better setting of each take."""
-    kept = [row for row in rows.values() if ("tsmape" in row[OIDN[0]]) == moving]
+    kept = rows_of(rows, moving=moving)
     if not kept:
         return
     columns = ["SMAPE over OIDN's", "worst", "PSNR beside OIDN's", "light", "tSMAPE over OIDN's"][: 5 if moving else 4]
     yield " | ".join([f"| {len(kept)} {'shots' if moving else 'stills'}", *columns]) + " |"
     yield "|---" + "|--:" * len(columns) + "|"
     for name in models:
-        ratios, changes = (
-            [row[name][key] / min(row[each][key] for each in OIDN) for row in kept if key in row[name]]
-            for key in ("smape", "tsmape")
-        )
+        found = ratios(rows, name, "smape", moving=moving)
         ahead = [row[name]["psnr"] - max(row[each]["psnr"] for each in OIDN) for row in kept]
         light = sum(row[name]["light"] for row in kept) / len(kept)
-        cells = [f"{mean(ratios):.3f}", f"{max(ratios):.3f}", f"{sum(ahead) / len(ahead):+.2f} dB", f"{light:.3f}"]
-        yield " | ".join([f"| {name}", *cells, *([f"{mean(changes):.3f}"] if moving else [])]) + " |"
+        cells = [f"{mean(found):.3f}", f"{max(found):.3f}", f"{sum(ahead) / len(ahead):+.2f} dB", f"{light:.3f}"]
+        cells += [f"{mean(ratios(rows, name, 'tsmape', moving=True)):.3f}"] if moving else []
+        yield " | ".join([f"| {name}", *cells]) + " |"
 
 
 def main() -> None:

@@ -16,9 +16,9 @@ import statistics
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from takes import OIDN, mean
+from takes import OIDN, Rows, mean, ratios
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
@@ -49,16 +49,11 @@ class Errors(NamedTuple):
     worst_still: float
 
 
-def errors_of(takes: dict[str, Any], name: str) -> Errors:
+def errors_of(takes: Rows, name: str) -> Errors:
     """The errors of a method."""
-    found: dict[tuple[str, bool], list[float]] = {}
-    for row in takes.values():
-        for key in row[name]:
-            if key in ("smape", "tsmape"):
-                best = min(row[each][key] for each in OIDN)
-                found.setdefault((key, "tsmape" in row[name]), []).append(row[name][key] / best)
-    shots, stills = found["smape", True], found["smape", False]
-    return Errors(mean(shots), max(shots), mean(found["tsmape", True]), mean(stills), max(stills))
+    shots, stills = (ratios(takes, name, "smape", moving=moving) for moving in (True, False))
+    flicker = ratios(takes, name, "tsmape", moving=True)
+    return Errors(mean(shots), max(shots), mean(flicker), mean(stills), max(stills))
 
 
 def milliseconds(times: dict[str, list[float]], name: str) -> dict[str, float]:
@@ -73,7 +68,7 @@ def lines(rows: Iterable[list[str]], heads: list[str]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [*head, *rows]) + "\n"
 
 
-def table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+def table(takes: Rows, times: dict[str, list[float]]) -> str:
     """Error and run time of all methods."""
     found = {name: (errors_of(takes, name), min(milliseconds(times, name).values())) for name in METHODS}
     least = [min(column) for column in zip(*(errors for errors, _ in found.values()), strict=True)]
@@ -86,7 +81,7 @@ def table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
     return lines(rows, ["", "shots: error", "worst", "flicker", "stills: error", "worst", "ms"])
 
 
-def time_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+def time_table(takes: Rows, times: dict[str, list[float]]) -> str:
     """Run times in both precisions."""
     found = {name: milliseconds(times, name) for name in METHODS}
     unit = found[next(iter(METHODS))]["float32"]
@@ -101,7 +96,7 @@ def time_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
     return lines(rows, ["method", "float32, ms", "bfloat16, ms", "over OIDN fast"])
 
 
-def single_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
+def single_table(takes: Rows, times: dict[str, list[float]]) -> str:
     """Every take: SMAPE of each method."""
     del times
     rows = []
@@ -112,14 +107,14 @@ def single_table(takes: dict[str, Any], times: dict[str, list[float]]) -> str:
     return lines(rows, ["take", *METHODS.values()])
 
 
-TABLES: dict[str, Callable[[dict[str, Any], dict[str, list[float]]], str]] = {
+TABLES: dict[str, Callable[[Rows, dict[str, list[float]]], str]] = {
     "errors": table,
     "times": time_table,
     "takes": single_table,
 }
 
 
-def plot(takes: dict[str, Any], times: dict[str, list[float]], path: Path) -> None:
+def plot(takes: Rows, times: dict[str, list[float]], path: Path) -> None:
     """Error over run time, of shots and of stills."""
     from matplotlib.figure import Figure
 
