@@ -37,6 +37,7 @@ def generate(
     parts: Flag = False,
     threads: int = 0,
     takes: Flag = False,
+    plain: Flag = False,
     assets: str | None = None,
     unseen: Flag = False,
 ) -> int | None:
@@ -59,8 +60,10 @@ def generate(
             task takes; 1 by default.
         takes: packed takes instead of sequences, OUT/000000.take.npz, ... --seeds are their numbers. A third are
             stills, the others have 16 frames with references on the last three. Pixel filter, lens, features and
-            samples are drawn, too. The only other options that count are --frames, --size, --reference-spp (from 2
-            on), --variant, --threads and the address of a cluster.
+            samples are drawn, too. The only other options that count are --plain, --frames, --size, --reference-spp
+            (from 2 on), --variant, --threads and the address of a cluster.
+        plain: takes of one sample at pixel centres, with features without noise, as most papers of interactive
+            denoising have them; no stills.
         assets: folder of the models, skies and normal maps, which are fetched to it; by default in the user's cache.
             With none, all objects are procedural.
         unseen: make scenes of the tenth of the assets that no other scene has, to measure on.
@@ -69,13 +72,15 @@ def generate(
         raise InputError("--parts: expected together with --renderer cycles: Mitsuba's path integrator has no parts")
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
+    if plain and not takes:
+        raise InputError("--plain: expected together with --takes: the other sequences of Mitsuba are plain")
     chosen, workers = parse_frames(seeds, name="--seeds"), parse_workers(rendering.workers)
     arguments = {**rendering.arguments(), "workers": workers or 1}
     plan: TakePlan | SequencePlan
     if takes:
         if renderer == "cycles":
             raise InputError("--takes: expected --renderer mitsuba, found cycles")
-        plan = _of_takes(Path(os.path.abspath(out)), rendering, frames, threads, _opened(assets), unseen)
+        plan = _of_takes(Path(os.path.abspath(out)), rendering, frames, threads, _opened(assets), unseen, plain)
     else:
         plan = SequencePlan(
             out=Path(os.path.abspath(out)),
@@ -113,7 +118,9 @@ def _opened(folder: str | None) -> Assets:
     return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
 
-def _of_takes(out: Path, rendering: RenderOptions, frames: int, threads: int, assets: Assets, unseen: bool) -> TakePlan:
+def _of_takes(
+    out: Path, rendering: RenderOptions, frames: int, threads: int, assets: Assets, unseen: bool, plain: bool
+) -> TakePlan:
     """How packed takes are rendered; options that have the defaults of sequences have those of takes."""
     given = {name: value for name, value in vars(rendering).items() if value != getattr(_FOR_TRAINING, name)}
     others = given.keys() - {"size", "reference_spp", "variant", "workers"}
@@ -130,6 +137,7 @@ def _of_takes(out: Path, rendering: RenderOptions, frames: int, threads: int, as
         frames=FRAMES if frames == _FRAMES else frames,
         size=parse_size(rendering.size) if "size" in given else None,
         half=rendering.reference_spp // 2 if "reference_spp" in given else HALF,
+        plain=plain,
     )
 
 

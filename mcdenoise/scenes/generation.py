@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +94,5 @@ class SequencePlan:
         size = (width, height) if self.cycles else (_PROBED, max(1, _PROBED * height // width))
         assets = self.assets.part(self.unseen)
         for attempt in range(ATTEMPTS):
-            take = draw_take(number, assets, attempt, frames=self.frames, size=size, stills=False)
-            plain = replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
-            yield take if self.cycles else plain
+            plain = not self.cycles
+            yield draw_take(number, assets, attempt, frames=self.frames, size=size, stills=False, plain=plain)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -42,6 +42,7 @@ class TakePlan:
         frames: of a take that is no still.
         size: width and height in pixels; by default those of training.
         half: samples a pixel of each half of a reference.
+        plain: whether takes are shots of one sample at pixel centres, with features without noise.
     """
 
     out: Path
@@ -52,13 +53,20 @@ class TakePlan:
     frames: int = FRAMES
     size: tuple[int, int] | None = None
     half: int = HALF
+    plain: bool = False
 
     @property
     def identity(self) -> dict[str, Any]:
         """What all takes of a folder have in common."""
         size = list(self.size) if self.size else None
         own = {"unseen": self.unseen, "assets": self.assets.digest, "frames": self.frames, "size": size}
-        return {"takes": 1, **own, "reference_spp": 2 * self.half}
+        return {"takes": 1, **own, **({"plain": True} if self.plain else {}), "reference_spp": 2 * self.half}
+
+    def draw(self, number: int) -> Iterator[Take]:
+        """Places for the take of a number, each for the case that those before show too little."""
+        assets, kind = self.assets.part(self.unseen), {"stills": not self.plain, "plain": self.plain}
+        for attempt in range(ATTEMPTS):
+            yield draw_take(number, assets, attempt, frames=self.frames, size=self.size, **kind)
 
     def render(self, number: int) -> Path:
         """Render the take of a number, if it is not there yet.
@@ -95,18 +103,18 @@ def _claim(plan: TakePlan) -> None:
         found = json.loads(read_text(about)) if about.exists() else plan.identity
     except (OSError, ValueError) as error:
         raise InputError(f"{plan.out}: expected a folder to write takes to, found {error}") from error
-    for key, value in plan.identity.items():
-        if found.get(key) != value:
+    own = plan.identity
+    for key in sorted(found.keys() | own):
+        if found.get(key) != own.get(key):
             raise InputError(
-                f"{plan.out}: expected takes with {key} {value}, found {found.get(key)}; choose another folder"
+                f"{plan.out}: expected takes with {key} {own.get(key)}, found {found.get(key)}; choose another folder"
             )
     write_json(about, plan.identity)
 
 
 def _render(plan: TakePlan, number: int, path: Path) -> None:
-    assets = plan.assets.part(plan.unseen)
-    draws = (draw_take(number, assets, each, frames=plan.frames, size=plan.size) for each in range(ATTEMPTS))
-    take, tracer, final = first_worth(draws, lambda take: TakeTracer(take, plan.variant, plan.threads, plan.half))
+    takes = plan.draw(number)
+    take, tracer, final = first_worth(takes, lambda take: TakeTracer(take, plan.variant, plan.threads, plan.half))
     last = len(take.cameras) - 1
     arrays = {name: np.empty((last + 1, *image.shape), np.float32) for name, image in final.items()}
     references = min(REFERENCES, last + 1)

@@ -89,6 +89,7 @@ def draw_take(
     frames: int = FRAMES,
     size: tuple[int, int] | None = None,
     stills: bool = True,
+    plain: bool = False,
 ) -> Take:
     """The take of a number, the same on every machine with the same assets.
 
@@ -99,6 +100,7 @@ def draw_take(
         frames: of a take that is no still.
         size: width and height in pixels; by default those of training.
         stills: whether it may be a still.
+        plain: whether it is sampled once at pixel centres through a pinhole, with features without noise.
     """
     place_rng, camera_rng, move_rng, rng = (
         np.random.default_rng(child) for child in np.random.SeedSequence((number, attempt)).spawn(4)
@@ -126,7 +128,7 @@ def draw_take(
     blur = math.exp(rng.uniform(*np.log(_BLUR)))
     pixel = 2 * focus * math.tan(math.radians(cameras[0].fov_x) / 2) / size[0]
     lens, splat = rng.random() < _LENS, rng.random() < _SPLAT
-    return Take(
+    take = Take(
         number=number,
         attempt=attempt,
         scene=scene,
@@ -145,6 +147,9 @@ def draw_take(
         white_lamps=bool(rng.random() < 0.5),
         credits=tuple(sorted(stock.credits)),
     )
+    if not plain:
+        return take
+    return replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
 
 
 def _narrowed(fov: float, zoom: float) -> float:
