@@ -20,7 +20,7 @@ import torch
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.engines import RayEngine
-from mcdenoise.film import Film, read_film, run_film
+from mcdenoise.film import read_film, run_film
 from mcdenoise.frame import Frame
 from mcdenoise.shot import ShotSettings
 
@@ -28,7 +28,6 @@ from mcdenoise.shot import ShotSettings
 def measure(nodes: int, shots: Path, out: Path) -> dict[str, float]:
     """Process the film on this number of nodes."""
     try:
-        import ray
         from ray.cluster_utils import Cluster
     except ImportError as error:
         raise SystemExit("film_scale.py: expected Ray, found none; pip install 'mcdenoise[ray]'") from error
@@ -36,21 +35,19 @@ def measure(nodes: int, shots: Path, out: Path) -> dict[str, float]:
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
     for _ in range(nodes):
         cluster.add_node(num_cpus=1)
-    ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
     try:
-        film = Film(read_film(shots / "*", ShotSettings("noisy")), out, threads=1)
+        engine = RayEngine(cluster.address)
         processor, began = time.process_time(), time.perf_counter()
-        result = run_film(film, RayEngine(cluster.address))
+        results = run_film(read_film(shots / "*", ShotSettings("noisy", threads=1)), out, engine)
         processor, taken = time.process_time() - processor, time.perf_counter() - began
     finally:
-        ray.shutdown()
         cluster.shutdown()
-    tasks = 3 * len(film.shots)
+    made, tasks = sum(each.made for each in results), 3 * len(results)
     return {
         "nodes": nodes,
-        "frames": result.made,
-        "frames_per_second": result.made / taken,
-        "driver_ms_per_frame": processor * 1e3 / result.made,
+        "frames": made,
+        "frames_per_second": made / taken,
+        "driver_ms_per_frame": processor * 1e3 / made,
         "driver_ms_per_task": processor * 1e3 / tasks,
     }
 

@@ -128,7 +128,6 @@ def write_frames(
     references: bool = False,
     unwritten: Collection[int] = (),
     of: int | None = None,
-    on_read: Callable[[int], object] = lambda number: None,
     on_frame: Callable[[], None] = lambda: None,
     on_output: Callable[[Frame, Output], None] | None = None,
     on_file: Callable[[int, Tensor], None] | None = None,
@@ -145,7 +144,6 @@ def write_frames(
         references: see :func:`denoise_sequence`.
         unwritten: frames that are denoised only to give the others their history; no files are written for them.
         of: number of frames of the whole shot, if these are its beginning; by default the shot ends with them.
-        on_read: called with the number of each frame before its files are read, in the reading thread.
         on_frame: see :func:`denoise_sequence`.
         on_output: see :func:`denoise_sequence`.
         on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the writing thread, after its
@@ -163,7 +161,7 @@ def write_frames(
         writing: Future[None] = writer.submit(lambda: None)
         seen: Tensor | None = None
         for number, frame, output in denoised_frames(
-            sequence, denoiser, reference=references, stages=on_output is not None, of=of, on_read=on_read
+            sequence, denoiser, reference=references, stages=on_output is not None, of=of
         ):
             if on_output is not None:
                 on_output(frame, output)
@@ -233,7 +231,6 @@ def denoised_frames(
     reference: bool = True,
     stages: bool = False,
     of: int | None = None,
-    on_read: Callable[[int], object] = lambda number: None,
 ) -> Iterator[tuple[int, Frame, Output]]:
     """Denoise frame after frame, while the next one is read if memory allows.
 
@@ -243,7 +240,6 @@ def denoised_frames(
         reference: also read references.
         stages: also return stages.
         of: see :func:`write_frames`.
-        on_read: see :func:`write_frames`.
 
     Yields:
         Number, frame and output; the denoiser's report includes the time of reading.
@@ -255,7 +251,6 @@ def denoised_frames(
 
     def read(number: int) -> tuple[Frame, float]:
         start = time.perf_counter()
-        on_read(number)
         frame = sequence.frame(number, reference=reference, buffers=wanted)
         # Depth may be computed from the positions.
         return frame if streaming else frame.with_depth().without_history(), _since(start)

@@ -7,13 +7,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
 
 from mcdenoise.cli._options import Out, Workers
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
-from mcdenoise.engines import open_engine, parse_workers, processors
+from mcdenoise.engines import Engine, LocalEngine, RayEngine, parse_workers
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, ShotResult, read_film, run_film, write_page
+from mcdenoise.film import ShotResult, read_film, run_film, write_page
 from mcdenoise.shot import ShotSettings
 
 
@@ -44,16 +45,18 @@ def film(
     if piece < 0:
         raise InputError(f"--piece: expected at least 0 frames, found {piece}")
     count = parse_workers(workers)
-    shots = read_film(manifest, ShotSettings(model))
+    # A process of a cluster has one processor where the film does not say otherwise; those of this machine share it.
+    threads = 1 if count is None else max(1, torch.get_num_threads() // count) if count > 1 else None
+    shots = read_film(manifest, ShotSettings(model, threads=threads))
     for settings in {each.settings.model: each.settings for each in shots if each.settings.model}.values():
         # The check of the film names a shot whose model cannot be made.
         with suppress(InputError):
             warn(filter(None, [settings.spelling.doubt]))
-    gpus = any(each.settings.device.startswith("cuda") for each in shots)
-    cpus = max(each.settings.threads or 1 for each in shots)
-    engine = open_engine(workers, cpus=cpus, gpus=float(gpus))
-    threads = cpus if count is None else max(1, processors() // count) if count > 1 else None
-    plan = Film(shots, out, piece, threads=threads)
+    if count is None:
+        gpus = any(each.settings.device.startswith("cuda") for each in shots)
+        engine: Engine = RayEngine(workers, cpus=max(each.settings.threads or 1 for each in shots), gpus=float(gpus))
+    else:
+        engine = LocalEngine(count)
     began = time.perf_counter()
     with progress_bar() as progress:
         task = progress.add_task(f"scan {len(shots)} shots", total=None)
@@ -63,35 +66,33 @@ def film(
             if total is not None:
                 progress.update(task, description=f"{made}/{total} frames, {rate:.2f}/s", completed=made, total=total)
 
-        result = run_film(plan, engine, on_progress=show, on_shot=_print_shot)
-    for each in result.shots:
-        if each.summary is not None:
-            warn(f"{each.shot.name}: {warning}" for warning in each.summary.warnings)
+        results = run_film(shots, out, engine, piece=piece, on_progress=show, on_shot=_print_shot)
+    for each in results:
+        if each.found is not None:
+            warn(f"{each.shot.name}: {warning}" for warning in each.found.warnings)
     print_rows(
         [
             {"shot": each.shot.name, "frames": frames, "failed": why}
-            for each in result.shots
+            for each in results
             for frames, why in each.failures()
         ]
     )
     page = ""
     try:
-        page = f", {write_page(plan, result)}"
+        page = f", {write_page(results, out)}"
     except InputError as error:
         warn([str(error)])
-    warn(filter(None, [result.trouble]))
-    rate = f", {result.made / result.seconds:.2f}/s" if result.made else ""
-    done = sum(each.complete for each in result.shots)
-    say(
-        f"{done} of {len(shots)} shots complete, {result.made} frames made in {result.seconds:.1f} s{rate}: {out}{page}"
-    )
-    return None if result.complete else 1
+    seconds, made = time.perf_counter() - began, sum(each.made for each in results)
+    rate = f", {made / seconds:.2f}/s" if made else ""
+    done = sum(each.complete for each in results)
+    say(f"{done} of {len(shots)} shots complete, {made} frames made in {seconds:.1f} s{rate}: {out}{page}")
+    return None if done == len(shots) else 1
 
 
 def _print_shot(result: ShotResult) -> None:
     """Print one line for a shot that is summarized or has failed."""
-    found = result.found
-    frames, kept = (len(found.numbers), len(found.done)) if found is not None else (0, 0)
+    frames = len(result.found.numbers) if result.found is not None else 0
+    kept = frames - len(result.missing)
     there = f", {kept} were there" if kept else ""
     failed = f", {len(result.failed)} failed" if result.failed else ", failed" if result.reason else ""
     picked = f"; picked {result.shot.picked}" if result.shot.picked else ""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import glob
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import msgspec
 
@@ -18,10 +18,9 @@ from mcdenoise.methods import WEIGHTS, check_names_no_code
 from mcdenoise.reading import read_text
 from mcdenoise.shot import ShotSettings
 
-# Folder of the thumbnails, beside the shots.
-PICTURES = "film_pictures"
+# Folders of the thumbnails and of the records, beside the shots.
+PICTURES, RECORDS = "film_pictures", ".film"
 _TAKEN = {"film.json", "film.html", PICTURES}
-_OWN = ("name", "input")
 _LONGEST_NAME = 200
 _LIMIT = 2**63
 
@@ -58,13 +57,12 @@ def read_film(manifest: Path, settings: ShotSettings | None = None) -> list[Shot
     Raises:
         InputError: the manifest cannot be read, has no shots, or has an unknown key or a wrong value.
     """
-    settings = _absolute(settings or ShotSettings(), Path.cwd(), ("model", "weights", "results"))
+    settings = _absolute(settings or ShotSettings(), Path.cwd())
     shots = _of_file(manifest, settings) if manifest.suffix == ".toml" else _of_pattern(manifest, settings)
     names: dict[str, Shot] = {}
     for shot in shots:
         # Some file systems do not tell upper case from lower case.
-        other = names.setdefault(shot.name.casefold(), shot)
-        if other is not shot:
+        if names.setdefault(shot.name.casefold(), shot) is not shot:
             raise InputError(
                 f"{manifest}: expected a name of its own for each shot, found '{shot.name}' twice; rename one"
             )
@@ -84,23 +82,15 @@ def _of_pattern(pattern: Path, settings: ShotSettings) -> list[Shot]:
     return [_shot("_".join(path.parts[p] for p in wildcards), (path,), settings, str(pattern)) for path in found]
 
 
-class _Entry(msgspec.Struct):
-    """What a table of a shot has beside settings."""
-
-    name: str
-    input: str | list[str]
-
-
 class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
     every: dict[str, Any] = {}
-    shot: list[_Entry] = []
+    shot: list[dict[str, Any]] = []
     shots: str = ""
 
 
 def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     try:
-        content = tomllib.loads(read_text(path))
-        manifest = msgspec.convert(content, _Manifest)
+        manifest = msgspec.convert(tomllib.loads(read_text(path)), _Manifest)
         if bool(manifest.shot) is bool(manifest.shots):
             raise ValueError("both or none of them")
     except OSError as error:
@@ -115,14 +105,18 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     if manifest.shots:
         return _of_pattern(path.parent / manifest.shots, settings)
     shots = []
-    for number, (entry, table) in enumerate(zip(manifest.shot, content["shot"], strict=True), 1):
-        where = f"{path}, shot {number} '{entry.name}'"
-        own = {key: value for key, value in table.items() if key not in _OWN}
-        inputs = [entry.input] if isinstance(entry.input, str) else entry.input
-        if not all(inputs) or "\0" in "".join(inputs) or not inputs:
-            raise InputError(f"{where}: expected 'input', folders, files or patterns, found {_found(entry.input)}")
+    for number, table in enumerate(manifest.shot, 1):
+        where = f"{path}, shot {number}"
+        name, inputs = table.pop("name", None), table.pop("input", None)
+        inputs = [inputs] if isinstance(inputs, str) else inputs
+        texts = [name, *inputs] if isinstance(inputs, list) else [None]
+        if not inputs or not all(isinstance(text, str) and text and "\0" not in text for text in texts):
+            raise InputError(
+                f"{where}: expected 'name', a text, and 'input', a folder, a file, a pattern, or a list of these"
+            )
+        where = f"{where} '{name}'"
         paths = tuple(path.parent / each for each in inputs)
-        shots.append(_shot(entry.name, paths, _settings(own, settings, where, path.parent), where))
+        shots.append(_shot(name, paths, _settings(table, settings, where, path.parent), where))
     return shots
 
 
@@ -138,59 +132,34 @@ def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: st
 
 def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base: Path) -> ShotSettings:
     """The settings, overridden by those of a table."""
-    kinds = get_type_hints(ShotSettings)
-    changed = {}
-    for key, value in table.items():
-        # Both spellings are accepted, that of the command line and that of Python.
-        name = key.replace("-", "_")
-        if name not in kinds:
-            meant = did_you_mean(name, [*kinds, *_OWN]) or "see `mcdenoise denoise --help`"
-            raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{key}'; {meant}")
-        try:
-            changed[name] = _typed(kinds[name], value)
-        except ValueError as error:
-            raise InputError(
-                f"{where}, {key}: {error}, found {_found(value)}; see `mcdenoise denoise --help`"
-            ) from error
-        if name == "model":
-            check_names_no_code(value, f"{where}, {key}")
-    made = _absolute(replace(settings, **changed), base, changed)
+    # Both spellings are accepted, that of the command line and that of Python.
+    table = {key.replace("-", "_"): value for key, value in table.items()}
+    known = asdict(settings)
+    for name in table.keys() - known:
+        meant = did_you_mean(name, [*known, "name", "input"]) or "see `mcdenoise denoise --help`"
+        raise InputError(f"{where}: expected a setting of `mcdenoise denoise`, found '{name}'; {meant}")
+    texts = {name: [table[name]] for name in ("map", "layers") if isinstance(table.get(name), str)}
     try:
+        for name, value in table.items():
+            # Written so that NaN is out of range.
+            if isinstance(value, int | float) and not abs(value) < _LIMIT:
+                raise ValueError(f"{name}: expected a number below 2^63")
+        made = msgspec.convert({**known, **table, **texts}, ShotSettings, dec_hook=lambda kind, value: kind(value))
         made.check()
         if made.frames is not None:
             parse_frames(made.frames)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
-    return made
+    except ValueError as error:
+        raise InputError(f"{where}: {printable(str(error))[:300]}; see `mcdenoise denoise --help`") from error
+    if made.model is not None and "model" in table:
+        check_names_no_code(made.model, f"{where}, model")
+    return _absolute(made, base)
 
 
-def _typed(kind: Any, value: Any) -> Any:
-    """Convert a value of TOML to the type of a setting."""
-    # Written so that NaN is out of range.
-    if isinstance(value, int | float) and not abs(value) < _LIMIT:
-        raise ValueError("expected a number below 2^63")
-    if kind == tuple[str, ...] and isinstance(value, str):
-        value = [value]
-    return msgspec.convert(value, kind, dec_hook=lambda kind, value: kind(value))
-
-
-def _absolute(settings: ShotSettings, base: Path, chosen: Iterable[str]) -> ShotSettings:
-    """The settings with absolute paths in the chosen ones, because workers may have other working folders."""
-    changed: dict[str, Any] = {}
-    for name in {"weights", "results"} & set(chosen):
-        if (path := getattr(settings, name)) is not None:
-            changed[name] = Path(os.path.abspath(base / path))
-    if "model" in chosen and (model := settings.model) is not None:
-        name = model.partition("(")[0].strip()
-        if name.endswith(WEIGHTS) or ".py:" in name:
-            changed["model"] = os.path.abspath(base / model)
+def _absolute(settings: ShotSettings, base: Path) -> ShotSettings:
+    """The settings with absolute paths, because workers may have other working folders."""
+    paths = {name: getattr(settings, name) for name in ("weights", "results")}
+    changed: dict[str, Any] = {name: Path(os.path.abspath(base / path)) for name, path in paths.items() if path}
+    name = (settings.model or "").partition("(")[0].strip()
+    if settings.model and (name.endswith(WEIGHTS) or ".py:" in name):
+        changed["model"] = os.path.abspath(base / settings.model)
     return replace(settings, **changed)
-
-
-def _found(value: Any) -> str:
-    try:
-        text = printable(repr(value))
-    except ValueError:
-        # A hexadecimal integer may have more digits than Python prints.
-        text = "a number of thousands of digits"
-    return "nothing" if value is None else text if len(text) <= 80 else f"{text[:77]}..."

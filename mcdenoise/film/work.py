@@ -1,368 +1,280 @@
-"""The tasks of a film: scan a shot, denoise a piece of it, and summarize it.
+"""The tasks of a film: look at a shot, and denoise a piece of it.
 
 A task depends on its arguments and on the disk alone, so that any worker can run it, and retry it. Arguments and
 answers are small: workers read and write the frames themselves.
+
+Each finished frame has a record, ``OUT/.film/SHOT/NUMBER.json``, by which the next run knows that it need not be
+denoised again. Its key is a digest of all that decides the result: the files of the frame and of those in its history,
+the settings, the weights and the version. A file has changed if its size or the time of its last change is another.
 """
 
 from __future__ import annotations
 
 import functools
+import hashlib
+import json
 import os
-import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO
 
+import msgspec
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import make_folder, remove, sweep
+from mcdenoise.data.files import make_folder, remove, write_text
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.engines import describe_error
 from mcdenoise.errors import InputError
-from mcdenoise.film.manifest import PICTURES, Shot
-from mcdenoise.film.pieces import Piece, cut
-from mcdenoise.film.record import (
-    FrameRecord,
-    Stamp,
-    digest_of,
-    digest_text,
-    read_records,
-    result_stamp,
-    stamp_and_digest,
-)
-from mcdenoise.folder import FrameError, check_apart, new_report, write_frames, write_report
+from mcdenoise.film.manifest import PICTURES, RECORDS, Shot
+from mcdenoise.folder import FrameError, new_report, prepare_folder, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models._remembered import frames_remembered
+from mcdenoise.models._report import FrameReport
 from mcdenoise.models._weights import find_weights
 from mcdenoise.preview import Preview
+from mcdenoise.reading import read_bytes
+from mcdenoise.shot import ShotSettings
 
-# Folder of the records, beside the shots.
-RECORDS = ".film"
+# Largest difference of a frame from that of the uncut shot, as a fraction; it decides where a piece begins.
+_JOINT = 1e-2
 # Settings that change no pixel of a result.
 _SILENT = {"frames", "threads", "preview", "preview_fps", "preview_exposure", "results", "max_memory"}
-# Largest side of the images whose change is measured, and of a thumbnail.
-_SMALL, _THUMBNAIL = 64, 320
-# Thumbnails across the shot, and of its worst frames.
-_STRIP, _WORST = 6, 3
+# Thumbnails of a shot, and their largest side.
+_PICTURES, _SIDE = 6, 320
+
+# Numbers of the frames that one worker denoises, one after the other; and of those that it writes, the last of them.
+Piece = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 @dataclass(frozen=True)
-class Order:
-    """The arguments that all tasks of a shot have in common.
+class FrameRecord:
+    """The record of a finished frame.
 
     Args:
-        shot: the shot.
-        out: folder of the film, as an absolute path.
-        joint: see :class:`mcdenoise.film.Film`.
-        threads: of torch; ``None`` for its own choice.
-        run: the beginning of the names of the journals of this run.
+        key: digest of all that decides its result.
+        file: name of the file that was written, in the folder of the shot.
+        stamp: its size, and the time of its last change, which a moved file keeps.
+        report: of the denoiser.
+        alike: whether the frame resembles the frame before, and yet finds no history in it.
     """
 
-    shot: Shot
-    out: Path
-    joint: float
-    threads: int | None = None
-    run: str = ""
-
-    @property
-    def folder(self) -> Path:
-        """The folder to which the frames are written."""
-        return self.out / self.shot.name
-
-    @property
-    def records(self) -> Path:
-        """The folder of the journals."""
-        return self.out / RECORDS / self.shot.name
-
-    def made(self) -> int:
-        """Number of frames that this run has finished, while workers add records of them."""
-        count = 0
-        for path in self.records.glob(f"{self.run}*.jsonl"):
-            with suppress(OSError), path.open("rb") as journal:
-                # A line that is still being written is counted by the next call.
-                count += sum(line.startswith(b"{") and line.endswith(b"\n") for line in journal)
-        return count
+    key: str
+    file: str
+    stamp: tuple[int, int]
+    report: FrameReport
+    alike: bool
 
 
 @dataclass(frozen=True)
 class Found:
-    """The result of :func:`scan`.
+    """What :func:`look` has found.
 
     Args:
         shot: the shot, with the model that limits have picked, if there are any.
         numbers: numbers of all frames.
         unreadable: for each frame that cannot be opened, by number, the reason.
-        overlap: number of frames that the history needs.
-        done: numbers of the finished frames.
+        overlap: number of frames that the history needs; ``None`` if it has no known length.
+        missing: numbers of the frames that are not finished.
+        pictures: paths of thumbnails relative to OUT, by number of the frame.
+        warnings: what is probably wrong, a line each.
     """
 
     shot: Shot
     numbers: tuple[int, ...]
-    unreadable: Mapping[int, str]
+    unreadable: dict[int, str]
     overlap: int | None
-    done: frozenset[int] = frozenset()
+    missing: frozenset[int] = frozenset()
+    pictures: tuple[tuple[int, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def pieces(self, length: int) -> list[Piece]:
+        """Cut the shot into pieces of equal length, and return those of which frames are missing.
+
+        The boundaries depend on the shot alone. A piece begins ``overlap`` frames before the first that it writes.
+
+        Args:
+            length: largest number of frames that a piece writes; 0 does not cut the shot, nor does a history without a
+                known length.
+
+        Example:
+            >>> shot = Found(Shot("a", (), ShotSettings()), tuple(range(6)), {}, 1, missing=frozenset({2, 3, 4}))
+            >>> shot.pieces(3)
+            [((0, 1, 2), (0, 1, 2)), ((2, 3, 4, 5), (3, 4, 5))]
+        """
+        count = 1 if self.overlap is None or length < 1 else -(-len(self.numbers) // length)
+        cuts = pairwise(len(self.numbers) * part // count for part in range(count + 1))
+        pieces = [(self.numbers[max(0, i - (self.overlap or 0)) : j], self.numbers[i:j]) for i, j in cuts]
+        return [piece for piece in pieces if self.missing.intersection(piece[1])]
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A shot with its frames opened, its denoiser, and a digest of all settings that decide a result."""
+    """A shot with its frames opened, its denoiser, its folders, and a digest of all settings that decide a result."""
 
     found: Found
     sequence: Sequence
     denoiser: Denoiser
+    folder: Path
+    records: Path
     settings: str
 
+    def keys(self, numbers: Iterable[int]) -> dict[int, str]:
+        """The keys of frames as their files are now."""
+        everything, overlap = self.found.numbers, self.found.overlap
+        stamps = functools.cache(lambda number: [_stamp(path) for path in self.sequence.files(number)])
+        keys = {}
+        for number in numbers:
+            place = everything.index(number)
+            window = everything[0 if overlap is None else max(0, place - overlap) : place + 1]
+            keys[number] = _digest(self.settings, *(stamp for each in window for stamp in stamps(each)))
+        return keys
 
-class Keys:
-    """Keys of frames, for which each file is read at most once.
-
-    A digest that is taken before the frame is read is that of the pixels, or of a file that is replaced meanwhile: then
-    it is that of no file any more, and the frame is not taken for a finished one.
-
-    Args:
-        opened: the shot.
-    """
-
-    def __init__(self, opened: Opened) -> None:
-        self.opened = opened
-        self._recorded: dict[Stamp, str] = {}
-        self._inputs: dict[int, tuple[tuple[Stamp, str], ...]] = {}
-
-    def inputs(self, number: int) -> tuple[tuple[Stamp, str], ...]:
-        """Stamps and digests of the files of a frame."""
-        if number not in self._inputs:
-            files = self.opened.sequence.files(number)
-            self._inputs[number] = tuple(stamp_and_digest(path, self._recorded) for path in files)
-        return self._inputs[number]
-
-    def key(self, number: int) -> str:
-        """The key of a frame: a digest of all that decides its result, with the frames in its history."""
-        numbers, overlap = self.opened.sequence.numbers, self.opened.found.overlap
-        place = numbers.index(number)
-        window = numbers[0 if overlap is None else max(0, place - overlap) : place + 1]
-        return digest_text(self.opened.settings, *(digest for each in window for _, digest in self.inputs(each)))
-
-    def finished(self, order: Order, numbers: Iterable[int]) -> dict[int, FrameRecord]:
-        """The records of those frames that are finished: whose results, inputs and settings are still the recorded."""
-        records = read_records(order.records)
-        self._recorded = dict(each for record in records.values() for each in record.inputs)
-        there = [n for n in numbers if n in records and records[n].is_there(order.folder)]
-        return {n: records[n] for n in there if records[n].key == self.key(n)}
+    def finished(self, keys: dict[int, str]) -> dict[int, FrameRecord]:
+        """The records of those frames that have these keys, and whose results are as they were written."""
+        found: dict[int, FrameRecord] = {}
+        for number, key in keys.items():
+            # A record that is missing or damaged is none: its frame is made again.
+            with suppress(OSError, ValueError, RecursionError):
+                record = msgspec.json.decode(read_bytes(self.records / f"{number}.json"), type=FrameRecord)
+                status = os.stat(self.folder / record.file)
+                if record.key == key and record.stamp == (status.st_size, status.st_mtime_ns):
+                    found[number] = record
+        return found
 
 
-@dataclass(frozen=True)
-class Summary:
-    """The summary of a shot.
+def look(shot: Shot, out: Path) -> Found:
+    """A task: find the frames of a shot, and which of them are finished; records of the others are removed.
 
-    Args:
-        milliseconds: median run time of each stage.
-        frames: for each frame ``number``, ``change``, ``history``, ``reset``, ``replaced_pixels`` and ``score``.
-        worst: the rows with the highest scores, and ``picture``, the path of a thumbnail relative to the page.
-        strip: number and thumbnail of some other frames across the shot.
-        warnings: what is probably wrong, a line each.
-        unfinished: the numbers of all other frames: those that failed, and those whose files have changed meanwhile.
-    """
-
-    milliseconds: Mapping[str, float] = field(default_factory=dict)
-    frames: tuple[Mapping[str, Any], ...] = ()
-    worst: tuple[Mapping[str, Any], ...] = ()
-    strip: tuple[tuple[int, str], ...] = ()
-    warnings: tuple[str, ...] = ()
-    unfinished: frozenset[int] = frozenset()
-
-
-def scan(order: Order) -> Found:
-    """A task: find the frames of a shot, and which of them are finished.
+    If all are, ``denoise.json`` and the preview are written.
 
     Raises:
-        InputError: the shot cannot be opened, or cannot be denoised with these settings.
+        InputError: the shot cannot be opened, or cannot be denoised with these settings; or something cannot be
+            written.
     """
-    opened = open_order(order)
-    return replace(opened.found, done=frozenset(Keys(opened).finished(order, opened.found.numbers)))
+    opened = open_shot(shot, out)
+    found, sequence = opened.found, opened.sequence
+    records = opened.finished(opened.keys(found.numbers))
+    missing = frozenset(found.numbers) - records.keys()
+    for number in missing:
+        remove(opened.records / f"{number}.json")
+    settings, spelling = found.shot.settings, found.shot.settings.spelling
+    report = new_report(sequence, str(spelling.weights or spelling.name), found.shot.picked)
+    report.frames = {number: each.report for number, each in records.items()}
+    report.files = {number: opened.folder / each.file for number, each in records.items()}
+    report.alike = [number for number, each in records.items() if each.alike]
+    if not missing and not found.unreadable:
+        write_report(sequence, opened.folder, opened.denoiser, report)
+        if settings.preview:
+            # From the files, since frames were denoised in any order.
+            shown = settings.preview_in(opened.folder, video=len(records) > 1)
+            for path in report.files.values():
+                shown.add(path.stem, *open_result(path).read(sequence.window))
+            shown.close()
+    warnings = (*sequence.warnings, *(report.warnings if records else []))
+    return replace(found, missing=missing, pictures=tuple(_pictures(out, shot.name, report.files)), warnings=warnings)
 
 
-def make(order: Order, piece: Piece) -> dict[int, str]:
+def _pictures(out: Path, name: str, files: dict[int, Path]) -> Iterable[tuple[int, str]]:
+    """Write thumbnails of some frames across the shot."""
+    numbers, shown = list(files), Preview(out / PICTURES / name, video=False)
+    for place in np.linspace(0, len(numbers) - 1, min(_PICTURES, len(numbers))).round().astype(int):
+        # A picture that cannot be made is missing on the page, and nothing else.
+        with suppress(InputError):
+            image, metadata = open_result(files[numbers[place]]).read()
+            shown.add(f"{numbers[place]}", avg_pool2d(image, -(-max(image.shape) // _SIDE), ceil_mode=True), metadata)
+            yield numbers[place], os.path.relpath(shown.written[-1], out)
+
+
+def make(shot: Shot, out: Path, piece: Piece) -> dict[int, str]:
     """A task: denoise the frames of a piece that are not finished, and record each as it is.
 
-    Args:
-        order: of the shot.
-        piece: the frames.
+    They are computed from the beginning of the piece, so that it does not matter whether it was interrupted.
 
     Returns:
-        For each failed frame, by number, the reason. A damaged frame fails alone, and the history begins anew after it;
-        where a result cannot be written, all frames that are left fail.
+        For each damaged frame, by number, the reason. It fails alone, and the history begins anew after it.
 
     Raises:
-        InputError: as :func:`scan`.
+        InputError: as :func:`look`, or a result cannot be written.
     """
-    opened = open_order(order)
-    make_folder(order.folder)
-    check_apart(opened.sequence, order.folder)
-    # That file says that the shot is complete.
-    remove(order.folder / "denoise.json")
-    left = set(piece.wanted) - Keys(opened).finished(order, piece.wanted).keys()
+    opened, (numbers, written) = open_shot(shot, out), piece
+    prepare_folder(opened.sequence, opened.folder)
+    make_folder(opened.records)
+    # Before the frames are read: if a file changes later, its frame has another key, and so is not finished.
+    keys = opened.keys(written)
+    left = set(written) - opened.finished(keys).keys()
+    last = max(left, default=-1)
+    numbers = tuple(number for number in numbers if number in left or (opened.found.overlap != 0 and number < last))
     failed: dict[int, str] = {}
-    try:
-        make_folder(order.records)
-        with (order.records / f"{order.run}{secrets.token_hex(8)}.jsonl").open("ab", buffering=0) as journal:
-            # A piece whose worker was lost goes on where it was, with the frames before that give it its history.
-            for part in cut(piece.numbers, left, 0, opened.found.overlap):
-                numbers, keys = list(part.numbers), Keys(opened)
-                while left & set(numbers):
-                    try:
-                        _write(order, keys, numbers, left, journal)
-                    except FrameError as error:
-                        numbers = [number for number in numbers if number > error.number]
-                        failed |= {number: str(error) for number in left & {error.number}}
-                        left -= {error.number}
-    except Exception as error:  # also of a user's model, or for lack of memory
-        failed |= dict.fromkeys(left, describe_error(error))
+    while left.intersection(numbers):
+        try:
+            _write(opened, numbers, left, keys)
+        except FrameError as error:
+            numbers = tuple(number for number in numbers if number > error.number)
+            failed |= {number: str(error) for number in left & {error.number}}
+            left -= {error.number}
     return failed
 
 
-def _write(order: Order, keys: Keys, numbers: list[int], left: set[int], journal: BinaryIO) -> None:
+def _write(opened: Opened, numbers: tuple[int, ...], left: set[int], keys: dict[int, str]) -> None:
     """Denoise frames, write those that are left, and record each as it is finished, which takes it from them."""
-    opened = keys.opened
-    settings = opened.found.shot.settings
     report = new_report(opened.sequence, "")
-    shown: Tensor | None = None
 
     def finished(number: int, image: Tensor) -> None:
         """Called in the thread that has written the file."""
-        nonlocal shown
-        before, shown = shown, _small(image)
         done = report.frames.pop(number)
         if number in left:
-            stamp = result_stamp(report.files.pop(number))
-            change = None if before is None else _difference(shown, before)
-            alike = number in report.alike
-            FrameRecord(number, keys.key(number), stamp, keys.inputs(number), done, alike, change).write(journal)
+            status = os.stat(path := report.files.pop(number))
+            stamp = status.st_size, status.st_mtime_ns
+            record = FrameRecord(keys[number], path.name, stamp, done, number in report.alike)
+            write_text(opened.records / f"{number}.json", msgspec.json.encode(record).decode())
             left.discard(number)
 
     write_frames(
         opened.sequence.part(numbers),
-        order.folder,
+        opened.folder,
         opened.denoiser,
         report,
-        full_float=settings.full_float,
-        output_layer=settings.output_layer,
+        full_float=opened.found.shot.settings.full_float,
+        output_layer=opened.found.shot.settings.output_layer,
         unwritten=[number for number in numbers if number not in left],
         of=len(opened.sequence),
-        on_read=keys.inputs,
         on_file=finished,
     )
 
 
-def summarize(order: Order) -> Summary:
-    """A task: write ``denoise.json`` of a complete shot, its thumbnails and its preview.
-
-    Raises:
-        InputError: as :func:`scan`, or something cannot be written.
-    """
-    opened = open_order(order)
-    shot, sequence = opened.found.shot, opened.sequence
-    found = Keys(opened).finished(order, sequence.numbers)
-    spelling = shot.settings.spelling
-    report = new_report(sequence, str(spelling.weights or spelling.name), shot.picked)
-    report.frames = {number: each.report for number, each in found.items()}
-    report.files = {number: order.folder / each.result[0] for number, each in found.items()}
-    report.alike = [number for number, each in found.items() if each.alike]
-    for folder in (order.folder, order.records):
-        sweep(folder, youngest=0)
-    unfinished = frozenset(sequence.numbers) - found.keys()
-    if not unfinished and not opened.found.unreadable:
-        write_report(sequence, order.folder, opened.denoiser, report)
-        if shot.settings.preview:
-            # From the files, since frames were denoised in any order.
-            shown = shot.settings.preview_in(order.folder, video=len(found) > 1)
-            for path in report.files.values():
-                shown.add(path.stem, *open_result(path).read(sequence.window))
-            shown.close()
-    warnings = [*sequence.warnings, *(report.warnings if found else [])]
-    rows = _described(found)
-    worst = sorted(rows, key=lambda row: (-row["score"], row["number"]))[:_WORST]
-    steps = np.linspace(0, len(rows) - 1, min(_STRIP, len(rows))).round().astype(int)
-    numbers = [row["number"] for row in (*worst, *(rows[step] for step in steps))]
-    pictures = _pictures(order, {number: report.files[number] for number in numbers})
-    worst = [{**row, "picture": pictures.pop(row["number"])} for row in worst if row["number"] in pictures]
-    strip = tuple(sorted(pictures.items()))
-    return Summary(report.milliseconds, tuple(rows), tuple(worst), strip, tuple(warnings), unfinished)
-
-
-def _described(records: Mapping[int, FrameRecord]) -> list[dict[str, Any]]:
-    """Rows of the page, a frame each; ``score`` is the smaller one of its changes from both neighbours."""
-    rows: list[dict[str, Any]] = []
-    for number, each in records.items():
-        sides = [records[n].change for n in (number, number + 1) if n in records]
-        rows.append(
-            {
-                "number": number,
-                "change": each.change,
-                "history": each.report.history,
-                "reset": each.report.reset,
-                "replaced_pixels": each.report.replaced_pixels,
-                "milliseconds": sum(each.report.milliseconds.values()),
-                "score": min((change for change in sides if change is not None), default=0.0),
-            }
-        )
-    return rows
-
-
-def _pictures(order: Order, files: Mapping[int, Path]) -> dict[int, str]:
-    """Write thumbnails of frames; their paths relative to the page, by number of the frame."""
-    shown = Preview(order.out / PICTURES / order.shot.name, video=False)
-    found = {}
-    for number, path in files.items():
-        with suppress(InputError):
-            image, metadata = open_result(path).read()
-            shown.add(f"{number}", _shrunk(image, _THUMBNAIL), metadata)
-            found[number] = os.path.relpath(shown.written[-1], order.out)
-    return found
-
-
 @functools.lru_cache(1)
-def open_order(order: Order) -> Opened:
+def open_shot(shot: Shot, out: Path) -> Opened:
     """Open a shot; the last one is cached, because a worker may denoise several pieces of it."""
     keep_heap()
-    if order.shot.settings.max_memory is not None:
+    if shot.settings.max_memory is not None:
         return_heap()
-    threads = order.shot.settings.threads or order.threads
-    if threads is not None:
-        torch.set_num_threads(threads)
-    sequence, unreadable = _open_what_opens(order.shot)
-    settings, choice = order.shot.settings.chosen(sequence)
-    # Digested first: if the file changes while it is read, the frames belong to a digest that no file has.
-    weights = _weights(settings)
-    denoiser = _denoiser(replace(settings, frames=None), *weights)
+    if shot.settings.threads is not None:
+        torch.set_num_threads(shot.settings.threads)
+    sequence, unreadable = _open_what_opens(shot)
+    settings, choice = shot.settings.chosen(sequence)
+    # Digested first: if a file changes while it is read, the frames belong to a digest that no file has.
+    files = [hashlib.sha256(path.read_bytes()).hexdigest() for path in _files_of_model(settings)]
+    denoiser = settings.denoiser()
     denoiser.reset(frames=len(sequence))
     streams = len(sequence) > 1 and denoiser.has_history(sequence.buffers)
-    overlap = frames_remembered(denoiser.model, order.joint) if streams else 0
-    listed = {key: str(value) for key, value in asdict(settings).items() if key not in _SILENT}
+    overlap = frames_remembered(denoiser.model, _JOINT) if streams else 0
+    listed = sorted((key, str(value)) for key, value in asdict(settings).items() if key not in _SILENT)
     # References do not change a result.
     rows = [str(row) for row in sequence.table if row.buffer != "reference"]
-    described = digest_text(
-        version("mcdenoise"), source_commit(), repr(sorted(listed.items())), *weights, *rows, str(overlap)
-    )
-    # After the scan the model is named, and the reason is that of the scan.
-    shot = replace(order.shot, settings=settings, picked=choice or order.shot.picked)
-    return Opened(Found(shot, tuple(sequence.numbers), unreadable, overlap), sequence, denoiser, described)
-
-
-@functools.lru_cache(1)
-def _denoiser(settings: Any, *weights: str) -> Denoiser:
-    """The denoiser; the digests of its files are there for the cache."""
-    denoiser: Denoiser = settings.denoiser()
-    return denoiser
+    digest = _digest(version("mcdenoise"), source_commit(), repr(listed), *files, *rows, str(overlap))
+    # Later the model is named, and the reason is that of the first look.
+    shot = replace(shot, settings=settings, picked=choice or shot.picked)
+    found = Found(shot, tuple(sequence.numbers), unreadable, overlap)
+    return Opened(found, sequence, denoiser, out / shot.name, out / RECORDS / shot.name, digest)
 
 
 def _open_what_opens(shot: Shot) -> tuple[Sequence, dict[int, str]]:
@@ -370,50 +282,37 @@ def _open_what_opens(shot: Shot) -> tuple[Sequence, dict[int, str]]:
     settings = shot.settings
     try:
         return settings.open(shot.inputs), {}
-    except InputError as error:
+    except InputError:
         refused: dict[int, str] = {}
         numbers = frame_numbers(shot.inputs, settings.frames)
         for number in numbers:
             try:
                 replace(settings, frames=str(number)).open(shot.inputs)
-            except InputError as own:
-                refused[number] = str(own)
-        good = [number for number in numbers if number not in refused]
+            except InputError as error:
+                refused[number] = str(error)
+        good = [str(number) for number in numbers if number not in refused]
         if not good or not refused:
             raise
-        try:
-            return replace(settings, frames=",".join(map(str, good))).open(shot.inputs), refused
-        except InputError:
-            raise error from None
+        return replace(settings, frames=",".join(good)).open(shot.inputs), refused
 
 
-def _weights(settings: Any) -> list[str]:
-    """Digests of the model's files: its weights, or its source if it is the user's."""
+def _files_of_model(settings: ShotSettings) -> list[Path]:
+    """The model's weights, or its source if it is the user's."""
     spelling = settings.spelling
-    paths = [spelling.weights] if spelling.weights else []
-    if ".py:" in spelling.model:
-        paths.append(Path(spelling.model.rpartition(":")[0]))
-    elif not paths and ":" not in spelling.model:
-        paths += [path for path in [find_weights(spelling.model)] if path is not None]
-    try:
-        return [digest_of(path) for path in paths]
-    except OSError as error:
-        raise InputError(f"{paths[0]}: expected a file to read, found: {error.strerror}; check the path") from error
+    paths = [spelling.weights, Path(spelling.model.rpartition(":")[0]) if ".py:" in spelling.model else None]
+    if not any(paths) and ":" not in spelling.model:
+        paths = [find_weights(spelling.model)]
+    return [path for path in paths if path is not None]
 
 
-def _small(image: Tensor) -> Tensor:
-    """A small image whose change from frame to frame is measured."""
-    return torch.log1p(_shrunk(image.detach().float(), _SMALL).clamp(0, 1e16)).cpu()
+def _stamp(path: Path) -> str:
+    """Name and size of a file, and time of its last change; zeros where there is no such file."""
+    with suppress(OSError):
+        status = os.stat(path)
+        # A copy may keep the time of its source, but not that of the last change of its entry.
+        return f"{path.name} {status.st_size} {max(status.st_mtime_ns, status.st_ctime_ns)}"
+    return f"{path.name} 0 0"
 
 
-def _shrunk(image: Tensor, side: int) -> Tensor:
-    """An image of at most this side."""
-    height, width = image.shape[-2:]
-    scale = side / max(height, width, side)
-    return F.adaptive_avg_pool2d(image, (max(1, round(height * scale)), max(1, round(width * scale))))
-
-
-def _difference(one: Tensor, other: Tensor) -> float | None:
-    if one.shape != other.shape:
-        return None
-    return float((one - other).abs().mean() / (one.mean() + other.mean()).clamp_min(1e-6))
+def _digest(*parts: str) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()

@@ -348,7 +348,7 @@ KINDS = {
     "results.json": Kind("results/results.json", json.loads, ("reader results", "report")),
     "earlier denoise.json": Kind("out/denoise.json", exactly, ("denoise again",)),
     "earlier image": Kind("out/denoised1.exr", exactly, ("denoise again",)),
-    "journal of a film": Kind("filmed/.film/wall/*.jsonl", exactly, ("film again",)),
+    "record of a frame": Kind("filmed/.film/wall/*.json", exactly, ("film again",)),
     "earlier image of a film": Kind("filmed/wall/denoised0.exr", exactly, ("film again",)),
     "earlier film.json": Kind("filmed/film.json", exactly, ("film again",)),
     "checkpoint": Kind("run/checkpoint.pt", exactly, ("train",)),

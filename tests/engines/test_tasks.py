@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,7 @@ import pytest
 from calls import die_at_first, fail, fail_strangely, mark
 
 from mcdenoise import engines
-from mcdenoise.engines import MOST_LOSSES, Job, LocalEngine, RayEngine, Task, open_engine, run_jobs
+from mcdenoise.engines import MOST_LOSSES, LocalEngine, RayEngine, Task, parse_workers, run_tasks
 from mcdenoise.errors import InputError
 
 
@@ -25,18 +28,17 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Run:
-    """Jobs with names, one task each, and what came of them."""
+    """Tasks with names, and what came of them."""
 
     def __init__(self) -> None:
         self.answers: dict[str, object] = {}
         self.failed: dict[str, str] = {}
-        self.jobs: list[Job] = []
+        self.tasks: deque[Task] = deque()
 
-    def add(self, name: str, function: object, *arguments: object, **options: Any) -> None:
-        self.jobs.append(self._job(name, Task(function, arguments, **options)))  # type: ignore[arg-type]
+    def add(self, name: str, function: Callable[..., Any], *arguments: object) -> None:
+        self.tasks.append(Task(function, arguments, partial(self._end, name)))
 
-    def _job(self, name: str, task: Task) -> Job:
-        [(answer, reason)] = yield [task]
+    def _end(self, name: str, answer: object, reason: str | None) -> None:
         if reason is None:
             self.answers[name] = answer
         else:
@@ -46,35 +48,25 @@ class Run:
 @pytest.mark.skipif(sys.platform == "win32", reason="processes kill themselves by a signal")
 def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> None:
     run = Run()
-
-    def in_turn() -> Job:
-        # Two tasks side by side, none, and one after them.
-        names: list[str] = []
-        for together in (["one", "other"], [], ["next"]):
-            names += [answer for answer, _ in (yield [Task(mark, (tmp_path, name)) for name in together])]
-        run.answers["in turn"] = names
-
-    run.jobs.append(in_turn())
+    # A task may add another at its end.
+    run.tasks.append(Task(mark, (tmp_path, "one"), lambda answer, reason: run.add("next", mark, tmp_path, answer)))
     run.add("failing", fail, "two\nlines")
     run.add("strange", fail_strangely)
     run.add("exits", sys.exit, 0)
     run.add("lost", die_at_first, tmp_path, "lost", 1)
     run.add("hopeless", die_at_first, tmp_path, "hopeless", MOST_LOSSES)
-    # This one advances with each attempt, so that it may lose more workers than others.
-    advances = {"progress": lambda: len(list(tmp_path.glob("advancing.try*")))}
-    run.add("advancing", die_at_first, tmp_path, "advancing", MOST_LOSSES + 1, **advances)
-    run_jobs(LocalEngine(2), run.jobs)
+    run_tasks(LocalEngine(2), run.tasks)
     assert f"{MOST_LOSSES} times" in run.failed.pop("hopeless")
     assert run.failed == {"failing": "RuntimeError: two lines", "strange": "Strange: 7 and 8", "exits": "SystemExit: 0"}
-    assert run.answers == {"in turn": ["one", "other", "next"], "lost": "lost", "advancing": "advancing"}
+    assert run.answers == {"next": "one", "lost": "lost"}
     # Nobody tries more often than that.
     assert not (tmp_path / "hopeless").exists()
 
 
 def test_workers_are_a_number_or_a_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert isinstance(open_engine("2"), LocalEngine)
+    assert (parse_workers("2"), parse_workers("auto")) == (2, None)
     with pytest.raises(InputError, match=r"--workers.*0"):
-        open_engine("0")
+        parse_workers("0")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"auto.*mcdenoise\[ray\]"):
         RayEngine("auto")
@@ -111,7 +103,7 @@ def test_every_process_may_be_killed_at_any_time(tmp_path: Path) -> None:
         if len(killed) < 3 and (not killed or len(run.answers) >= len(killed)):
             killed.append(kill_children())
 
-    run_jobs(LocalEngine(2), run.jobs, attack)
+    run_tasks(LocalEngine(2), run.tasks, attack)
     assert run.failed == {}
     assert min(killed) >= 1
     assert sorted(path.name for path in tmp_path.iterdir()) == names

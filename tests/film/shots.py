@@ -19,14 +19,11 @@ from mcdenoise.frame import Frame
 class Inline:
     """An engine that does every task at once, in this process, and loses those that ``lose`` selects."""
 
-    lost = (BrokenExecutor,)
+    lost, slots = (BrokenExecutor,), 1
 
     def __init__(self, lose: Callable[[str, int], bool] = lambda task, count: False) -> None:
         self.tasks: list[str] = []
         self.lose = lose
-
-    def slots(self) -> int:
-        return 1
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Outcome]:
         self.tasks.append(function.__name__)
@@ -41,7 +38,7 @@ class Inline:
         return done
 
     def close(self) -> None:
-        work.open_order.cache_clear()
+        work.open_shot.cache_clear()
 
 
 def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:

@@ -10,7 +10,7 @@ from commands import refuses, succeeds
 from shots import Inline, edit, same, write_manifest, write_shot
 
 from mcdenoise.data import Sequence
-from mcdenoise.film import Film, FilmResult, read_film, run_film
+from mcdenoise.film import ShotResult, read_film, run_film
 
 SHOT = '[[shot]]\nname = "{}"\ninput = "s1"\nframes = "0-1"\n{}\n'
 DIGITS = "1" + 5000 * "0"
@@ -21,9 +21,9 @@ def shot(tmp_path: Path) -> Path:
     return write_shot(tmp_path / "s1", 5)
 
 
-def run(shot: Path, out: Path) -> FilmResult:
+def run(shot: Path, out: Path) -> ShotResult:
     manifest = write_manifest(out.parent / "film.toml", {"s1": shot}, model="accumulated")
-    return run_film(Film(read_film(manifest), out), Inline())
+    return run_film(read_film(manifest), out, Inline())[0]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_the_model_that_a_limit_picks_is_told_everywhere(shot: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("when", ["before it is read", "after it was read", "after it was denoised"])
-def test_a_frame_that_changes_while_the_film_runs_is_made_again(
+def test_a_frame_that_changes_while_the_film_runs_is_made_again_by_the_next_run(
     shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     path, read = shot / "inputs/color2.exr", Sequence.frame
@@ -98,13 +98,17 @@ def test_a_frame_that_changes_while_the_film_runs_is_made_again(
     monkeypatch.undo()
     assert not left
     assert path.stat().st_size == status.st_size
-    assert result.complete
+    assert not result.complete
+    assert set(result.failed) == {2, 3, 4}
+    assert "changed" in result.failed[2]
+    assert not (tmp_path / "out/s1/denoise.json").exists()
+    assert run(shot, tmp_path / "out").complete
     assert run(shot, tmp_path / "fresh").complete
     assert same(tmp_path / "out/s1", tmp_path / "fresh/s1")
     assert run(shot, tmp_path / "out").made == 0
 
 
-def test_a_result_that_vanishes_while_the_film_runs_is_made_again(
+def test_a_result_that_vanishes_while_the_film_runs_is_made_again_by_the_next_run(
     shot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, read, left = tmp_path / "out", Sequence.frame, [1]
@@ -115,5 +119,6 @@ def test_a_result_that_vanishes_while_the_film_runs_is_made_again(
         return read(self, number, **options)
 
     monkeypatch.setattr(Sequence, "frame", frame)
+    assert set(run(shot, out).failed) == {1}
     assert run(shot, out).complete
     assert len(list(out.glob("s1/*.exr"))) == 5

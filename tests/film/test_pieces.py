@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,13 @@ from torch.utils import _pytree as pytree
 from mcdenoise import ops
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.film.manifest import Shot
-from mcdenoise.film.pieces import cut
-from mcdenoise.film.work import Order, make, scan
+from mcdenoise.film.work import Found, look, make
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model, list_models
 from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.shot import ShotSettings
+
+SHOT = Shot("s", (), ShotSettings())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -26,34 +28,33 @@ def test_every_missing_frame_is_made_once_with_the_frames_before_it(seed: int) -
     numbers = sorted(g.sample(range(200), g.randint(1, 120)))
     missing = {number for number in numbers if g.random() < g.choice([0.02, 0.5, 1.0])}
     length, overlap = g.choice([0, 1, 7, 30]), g.choice([None, 0, 1, 5, 40])
-    pieces = cut(numbers, missing, length, overlap)
-    made = [number for piece in pieces for number in piece.wanted]
-    assert sorted(made) == sorted(missing)
-    for piece in pieces:
-        places = [numbers.index(number) for number in piece.numbers]
+    pieces = Found(SHOT, tuple(numbers), {}, overlap, frozenset(missing)).pieces(length)
+    made = [number for _, written in pieces for number in written]
+    assert missing <= set(made)
+    assert len(made) == len(set(made))
+    for computed, written in pieces:
+        places = [numbers.index(number) for number in computed]
         # One after the other, without a gap, and nothing behind the last.
         assert places == list(range(places[0], places[-1] + 1))
-        assert piece.numbers[-1] == piece.wanted[-1]
-        assert len(piece.wanted) <= length or length == 0 or overlap is None
-        # A worker that takes over a piece finds enough frames in it, too.
-        left = {number for number in piece.wanted if g.random() < 0.5}
-        again = cut(piece.numbers, left, 0, overlap)
-        assert sorted(number for part in again for number in part.wanted) == sorted(left)
-        for number in piece.wanted:
+        assert computed[-len(written) :] == written
+        assert missing.intersection(written)
+        assert len(written) <= length or length == 0 or overlap is None
+        for number in written:
             before = numbers.index(number) - places[0]
             assert before >= (math.inf if overlap is None else overlap) or places[0] == 0
 
 
 def test_pieces_do_not_depend_on_what_is_missing() -> None:
-    whole = cut(range(100), range(100), length=30, overlap=5)
-    assert [(piece.numbers[0], piece.wanted[0], piece.wanted[-1]) for piece in whole] == [
+    found = Found(SHOT, tuple(range(100)), {}, 5, frozenset(range(100)))
+    whole = found.pieces(30)
+    assert [(computed[0], written[0], written[-1]) for computed, written in whole] == [
         (0, 0, 24),
         (20, 25, 49),
         (45, 50, 74),
         (70, 75, 99),
     ]
     for piece in whole:
-        assert cut(range(100), piece.wanted, length=30, overlap=5) == [piece]
+        assert replace(found, missing=frozenset(piece[1][3:7])).pieces(30) == [piece]
 
 
 def test_an_average_remembers_what_its_alpha_says() -> None:
@@ -88,23 +89,21 @@ def long_shot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("settings", "joint"),
-    [(ShotSettings("accumulated", alpha_min=0.4), 1e-2), (ShotSettings("noisy"), 1e-2)],
-    ids=lambda value: str(getattr(value, "model", value)),
+    "settings",
+    [ShotSettings("accumulated", alpha_min=0.4, threads=1), ShotSettings("noisy", threads=1)],
+    ids=lambda settings: str(settings.model),
 )
 def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
-    long_shot: Path, tmp_path: Path, settings: ShotSettings, joint: float
+    long_shot: Path, tmp_path: Path, settings: ShotSettings
 ) -> None:
     shot = Shot("long", (long_shot,), settings)
     images = {}
     for name, length in (("whole", 0), ("cut", 12)):
-        order = Order(shot, tmp_path / name, joint, 1)
-        found = scan(order)
-        pieces = cut(found.numbers, found.numbers, length, found.overlap)
+        pieces = look(shot, tmp_path / name).pieces(length)
         assert len(pieces) == (2 if length else 1)
         for piece in pieces:
-            assert not make(order, piece)
-        images[name] = pixels(order.folder)
+            assert not make(shot, tmp_path / name, piece)
+        images[name] = pixels(tmp_path / name / shot.name)
     errors = {
         int(file.removeprefix("denoised").removesuffix(".exr")): float(
             smape_linear(*(torch.from_numpy(images[name][file]).permute(2, 0, 1)[None] for name in images))
@@ -114,5 +113,5 @@ def test_a_shot_in_pieces_is_the_whole_one_up_to_the_joint(
     assert len(errors) == 24
     # The first piece has all frames before it, and a method without a history none to miss.
     assert max(errors[number] for number in range(12)) == 0
-    assert max(errors.values()) <= joint
+    assert max(errors.values()) <= 1e-2
     assert (max(errors.values()) == 0) is (settings.model == "noisy")

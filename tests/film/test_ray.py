@@ -11,7 +11,7 @@ from shots import pixels, same, write_manifest, write_shot
 
 from mcdenoise.engines import LocalEngine, RayEngine
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, read_film, run_film
+from mcdenoise.film import read_film, run_film
 
 ray = pytest.importorskip("ray", reason="films on a cluster need Ray: pip install 'mcdenoise[ray]'")
 # The warnings are Ray's own; none is of this package.
@@ -34,8 +34,8 @@ def cluster() -> Iterator[Any]:
 def test_a_lost_node_loses_nothing(cluster: Any, tmp_path: Path) -> None:
     made, nodes = cluster
     shots = {f"s{i}": write_shot(tmp_path / f"in{i}", FRAMES, seed=i) for i in range(4)}
-    manifest = write_manifest(tmp_path / "film.toml", shots, model="accumulated")
-    assert run_film(Film(read_film(manifest), tmp_path / "quiet", threads=1), LocalEngine(1)).complete
+    manifest = write_manifest(tmp_path / "film.toml", shots, model="accumulated", threads=1)
+    assert all(each.complete for each in run_film(read_film(manifest), tmp_path / "quiet", LocalEngine(1)))
     out = tmp_path / "out"
     lost = threading.Event()
 
@@ -48,9 +48,9 @@ def test_a_lost_node_loses_nothing(cluster: Any, tmp_path: Path) -> None:
 
     killer = threading.Thread(target=lose, daemon=True)
     killer.start()
-    result = run_film(Film(read_film(manifest), out, threads=1), RayEngine(made.address))
+    results = run_film(read_film(manifest), out, RayEngine(made.address))
     assert lost.wait(60)
-    assert result.complete, [each.failures() for each in result.shots]
+    assert all(each.complete for each in results), [each.failures() for each in results]
     for name in shots:
         assert len(pixels(out / name)) == FRAMES
         assert same(out / name, tmp_path / "quiet" / name)

@@ -15,8 +15,7 @@ from shots import Inline, edit, pixels, same, write_manifest, write_shot
 
 from mcdenoise.data.files import held
 from mcdenoise.errors import InputError
-from mcdenoise.film import Film, FilmResult, read_film, run_film
-from mcdenoise.film.record import read_records
+from mcdenoise.film import ShotResult, read_film, run_film
 from mcdenoise.shot import ShotSettings
 
 MODEL = "accumulated"
@@ -27,15 +26,23 @@ def shots(tmp_path: Path) -> dict[str, Path]:
     return {f"s{i}": write_shot(tmp_path / "renders" / f"s{i}", 4 + i, seed=i) for i in range(2)}
 
 
-def run(shots: dict[str, Path], out: Path, engine: Inline | None = None, piece: int = 200, **every: Any) -> FilmResult:
+def run(shots: dict[str, Path], out: Path, engine: Inline | None = None, **every: Any) -> list[ShotResult]:
     manifest = write_manifest(out.parent / "film.toml", shots, **{"model": MODEL, **every})
-    return run_film(Film(read_film(manifest), out, piece), engine or Inline())
+    return run_film(read_film(manifest), out, engine or Inline())
+
+
+def complete(results: list[ShotResult]) -> bool:
+    return all(each.complete for each in results)
+
+
+def made(results: list[ShotResult]) -> int:
+    return sum(each.made for each in results)
 
 
 def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> None:
-    result = run(shots, tmp_path / "out")
-    assert result.complete
-    assert result.made == 9
+    results = run(shots, tmp_path / "out")
+    assert complete(results)
+    assert made(results) == 9
     for name, folder in shots.items():
         succeeds("denoise", folder, "-o", tmp_path / name, "--model", MODEL)
         assert same(tmp_path / "out" / name, tmp_path / name)
@@ -56,44 +63,48 @@ def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Pa
     run(shots, tmp_path / "out")
     times = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("s*/*.exr")}
     engine = Inline()
-    result = run(shots, tmp_path / "out", engine)
-    assert (result.complete, result.made) == (True, 0)
+    results = run(shots, tmp_path / "out", engine)
+    assert (complete(results), made(results)) == (True, 0)
     assert "make" not in engine.tasks
     assert times == {path: path.stat().st_mtime_ns for path in times}
-    # Files that were copied, and so have other times, are the same files.
-    for path in shots["s0"].glob("inputs/*"):
-        os.utime(path)
-    assert run(shots, tmp_path / "out").made == 0
+    # A film may be moved.
+    (tmp_path / "out").rename(tmp_path / "moved")
+    assert made(run(shots, tmp_path / "moved")) == 0
 
 
 @pytest.mark.parametrize(
-    ("change", "made"),
+    ("change", "again"),
     [
         # A frame of another file, and those that remember it.
         (lambda shots, out: edit(shots["s1"] / "inputs/color3.exr"), [3, 4]),
         (lambda shots, out: edit(shots["s1"] / "inputs/albedo0.exr"), [0, 1, 2, 3, 4]),
         (lambda shots, out: (out / "s1/denoised2.exr").unlink(), [2]),
         (lambda shots, out: edit(out / "s1/denoised2.exr"), [2]),
-        # The record of the frames is damaged.
-        (lambda shots, out: truncate(next((out / ".film/s1").glob("*.jsonl"))), [4]),
+        # The record of a frame is damaged.
+        (lambda shots, out: truncate(out / ".film/s1/3.json"), [3]),
         # References change no result.
         (lambda shots, out: shutil.copy(shots["s1"] / "inputs/color0.exr", shots["s1"] / "inputs/reference0.exr"), []),
     ],
     ids=["color", "albedo", "gone", "edited", "record", "reference"],
 )
 def test_changed_frames_are_made_again(
-    shots: dict[str, Path], tmp_path: Path, change: Callable[[dict[str, Path], Path], object], made: list[int]
+    shots: dict[str, Path], tmp_path: Path, change: Callable[[dict[str, Path], Path], object], again: list[int]
 ) -> None:
     run(shots, tmp_path / "out")
+    before = written(tmp_path / "out")
     change(shots, tmp_path / "out")
-    before = {number: record.at for number, record in read_records(tmp_path / "out/.film/s1").items()}
-    result = run({"s1": shots["s1"]}, tmp_path / "out")
-    after = {number: record.at for number, record in read_records(tmp_path / "out/.film/s1").items()}
+    (result,) = run({"s1": shots["s1"]}, tmp_path / "out")
+    after = written(tmp_path / "out")
     assert result.complete
-    assert [number for number in after if after[number] != before.get(number)] == made
-    assert result.made == len(made)
+    assert [number for number in after if after[number] != before[number]] == again
+    assert result.made == len(again)
     run({"s1": shots["s1"]}, tmp_path / "fresh")
     assert same(tmp_path / "out/s1", tmp_path / "fresh/s1")
+
+
+def written(out: Path) -> dict[int, int]:
+    """When each frame was written."""
+    return {number: (out / f"s1/denoised{number}.exr").stat().st_mtime_ns for number in range(5)}
 
 
 def truncate(path: Path) -> None:
@@ -102,19 +113,19 @@ def truncate(path: Path) -> None:
 
 def test_other_settings_make_all_anew_and_silent_ones_nothing(shots: dict[str, Path], tmp_path: Path) -> None:
     run(shots, tmp_path / "out")
-    assert run(shots, tmp_path / "out", threads=1).made == 0
-    assert run(shots, tmp_path / "out", alpha_min=0.3).made == 9
-    assert run(shots, tmp_path / "out", model="noisy").made == 9
+    assert made(run(shots, tmp_path / "out", threads=1)) == 0
+    assert made(run(shots, tmp_path / "out", alpha_min=0.3)) == 9
+    assert made(run(shots, tmp_path / "out", model="noisy")) == 9
 
 
 def test_lost_tasks_are_done_again_and_again_but_not_for_ever(shots: dict[str, Path], tmp_path: Path) -> None:
-    quiet = run(shots, tmp_path / "quiet")
+    assert complete(run(shots, tmp_path / "quiet"))
     engine = Inline(lambda task, count: count % 3 == 0)
-    assert run(shots, tmp_path / "out", engine).complete == quiet.complete is True
+    assert complete(run(shots, tmp_path / "out", engine))
     assert all(same(tmp_path / "out" / name, tmp_path / "quiet" / name) for name in shots)
-    result = run(shots, tmp_path / "never", Inline(lambda task, count: task == "make"))
-    assert not result.complete
-    ((frames, why),) = result.shots[0].failures()
+    results = run(shots, tmp_path / "never", Inline(lambda task, count: task == "make"))
+    assert not complete(results)
+    ((frames, why),) = results[0].failures()
     assert frames == "0 to 3 (4)"
     assert "lost, 5 times" in why
     assert not list((tmp_path / "never").glob("s*/*.exr"))
@@ -129,16 +140,15 @@ def test_a_damaged_frame_fails_alone(shots: dict[str, Path], tmp_path: Path, dam
     path = shots["s1"] / "inputs/color2.exr"
     whole = path.read_bytes()
     damage(path)
-    result = run(shots, tmp_path / "out")
-    assert not result.complete
-    assert result.shots[0].complete
-    assert set(result.shots[1].failed) == {2}
-    assert "color2.exr" in result.shots[1].failed[2]
+    results = run(shots, tmp_path / "out")
+    assert [each.complete for each in results] == [True, False]
+    assert set(results[1].failed) == {2}
+    assert "color2.exr" in results[1].failed[2]
     assert sorted(pixels(tmp_path / "out/s1")) == [f"denoised{n}.exr" for n in (0, 1, 3, 4)]
     assert not (tmp_path / "out/s1/denoise.json").exists()
     # It is rendered again; what remembers it is made again too.
     path.write_bytes(whole)
-    assert run(shots, tmp_path / "out").complete
+    assert complete(run(shots, tmp_path / "out"))
     run(shots, tmp_path / "fresh")
     assert same(tmp_path / "out/s1", tmp_path / "fresh/s1")
     assert (tmp_path / "out/s1/denoise.json").exists()
@@ -170,17 +180,16 @@ def test_a_full_disk_ends_a_piece_and_no_more(
         replace(source, target)
 
     monkeypatch.setattr(os, "replace", full)
-    result = run(shots, tmp_path / "out")
-    assert not result.complete
-    assert result.shots[1].complete
-    ((frames, why),) = result.shots[0].failures()
+    results = run(shots, tmp_path / "out")
+    assert [each.complete for each in results] == [False, True]
+    ((frames, why),) = results[0].failures()
     assert frames == "0 to 3 (4)"
     assert "No space left on device" in why
     # One was tried, and not every frame.
     assert len(count) == 1
     assert [path.name for path in (tmp_path / "out/s0").iterdir()] == []
     monkeypatch.undo()
-    assert run(shots, tmp_path / "out").complete
+    assert complete(run(shots, tmp_path / "out"))
 
 
 def test_a_model_that_fails_is_no_fault_of_the_film(shots: dict[str, Path], tmp_path: Path) -> None:
@@ -189,8 +198,8 @@ def test_a_model_that_fails_is_no_fault_of_the_film(shots: dict[str, Path], tmp_
     )
     manifest = write_manifest(tmp_path / "film.toml", shots)
     settings = ShotSettings(f"{tmp_path}/mine.py:make")
-    result = run_film(Film(read_film(manifest, settings), tmp_path / "out"), Inline())
-    assert result.shots[0].failures() == [("0 to 3 (4)", "ArithmeticError: no way")]
+    results = run_film(read_film(manifest, settings), tmp_path / "out", Inline())
+    assert results[0].failures() == [("0 to 3 (4)", "ArithmeticError: no way")]
 
 
 def test_two_films_in_one_folder(shots: dict[str, Path], tmp_path: Path) -> None:

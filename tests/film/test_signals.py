@@ -17,7 +17,7 @@ FRAMES = 60
 SECONDS = 240.0
 PHASES: dict[str, Callable[[Path], bool]] = {
     "looking": lambda out: (out / ".film/.lock").exists(),
-    "first frame": lambda out: bool(list(out.glob(".film/s/*.jsonl"))),
+    "first frame": lambda out: bool(list(out.glob(".film/s/*.json"))),
     "middle": lambda out: len(list(out.glob("s/*.exr"))) >= FRAMES // 3,
     "closing": lambda out: len(list(out.glob("s/*.exr"))) == FRAMES,
 }
