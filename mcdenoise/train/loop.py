@@ -31,9 +31,10 @@ from mcdenoise.models import (
     start_with,
 )
 from mcdenoise.models._defaults import plain_defaults
+from mcdenoise.train.cache import writing
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
-from mcdenoise.train.data import DataFolders, TrainingData
+from mcdenoise.train.data import TrainingData
 from mcdenoise.train.devices import open_fabric
 from mcdenoise.train.front import split
 from mcdenoise.train.losses import stage_loss, stage_weights
@@ -119,12 +120,10 @@ def train(
     torch.manual_seed(config.seed)
     network, settings, start = begun(config, initial_weights)
     front, rest = split(network)
-    folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
-
     run, settled = RunFolder(out), dataclasses.asdict(config)
     run.check(config=settled)
     with fabric.rank_zero_first():
-        data = folders.load(cache or out / "cache")
+        data = TrainingData.load(config, front, rest.needs, sequences, validation or [], cache or out / "cache")
     identity = {"credits": credits, "initial_weights": start, **data.description}
     identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
@@ -144,7 +143,7 @@ def train(
         return weights
     # The source tree may change between interruptions of the run.
     provenance.append({"first_step": first, "commit": source_commit()})
-    with _writing(out), run.held() if fabric.is_global_zero else nullcontext():
+    with writing(out), run.held() if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
             about = about_weights(settled, identity, config.steps, provenance)
@@ -353,13 +352,3 @@ def _quiet_threads() -> Iterator[None]:
         yield
     finally:
         threading.excepthook = before
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    """Convert errors of the operating system to an ``InputError``."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{out}: cannot be written ({reason}); check its permissions and free space") from error

@@ -47,7 +47,8 @@ def validate(
     for i, (name, shot) in enumerate(watched):
         state: State = None
         for t in range(len(shot)):
-            frame = Clip.of(shot.cut(slice(t, t + 1)).read()).to(fabric.device).frame(0)
+            clip = Clip({name: buffer[None] for name, buffer in shot.read(slice(t, t + 1)).items()})
+            frame = clip.to(fabric.device).frame(0)
             with fabric.autocast():
                 output, state = model(frame, state)
             images = {RESULT: output.image, **output.stages}
