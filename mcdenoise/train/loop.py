@@ -18,7 +18,7 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mcdenoise.commit import source_commit
-from mcdenoise.data.files import atomic_path
+from mcdenoise.data.files import atomic_path, held
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import (
@@ -143,7 +143,7 @@ def train(
         return weights
     # The source tree may change between interruptions of the run.
     provenance.append({"first_step": first, "commit": source_commit()})
-    with writing(out), run.held() if fabric.is_global_zero else nullcontext():
+    with writing(out), held(out, "training") if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
             about = about_weights(settled, identity, config.steps, provenance)

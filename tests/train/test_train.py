@@ -271,15 +271,6 @@ def test_two_processes_learn_what_one_does(shared_sequence: Path, tmp_path: Path
 # Refusals
 
 
-def test_a_run_that_had_a_width_goes_on_as_one_with_settings(again: Callable[..., Path], tmp_path: Path) -> None:
-    path = tmp_path / "run" / "config.json"
-    config = json.loads(path.read_text())
-    path.write_text(json.dumps({**config, "settings": "", "width": 4}))
-    assert again()
-    path.write_text(json.dumps({**config, "settings": "", "width": 5}))
-    assert "found settings='width=5'" in refused(again)
-
-
 def test_another_config_or_other_data_need_another_folder(
     again: Callable[..., Path], shared_sequence: Path, tmp_path: Path
 ) -> None:
