@@ -82,8 +82,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, device: str = "cpu") -> Cal
     """A function that makes the next training step and returns its loss; all start from the same weights."""
     torch.manual_seed(config.seed)
     fabric = open_fabric(device, config.precision, config.batch)
-    losses = {"image": 1.0, "initial": 1.0}
-    trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
+    trainer = Trainer(config, create_model(config.model).train(), fabric, has_state=False)
     numbers = itertools.count()
 
     def step() -> float:

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import (
     Model,
-    Output,
     State,
     create_model,
     describe_weights,
@@ -37,7 +36,7 @@ from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import TrainingData
 from mcdenoise.train.devices import open_fabric
 from mcdenoise.train.front import split
-from mcdenoise.train.losses import stage_loss, stage_weights
+from mcdenoise.train.losses import stage_loss
 from mcdenoise.train.run_folder import Provenance, RunFolder, about_weights
 from mcdenoise.train.unroll import Unrolled
 from mcdenoise.train.validation import validate
@@ -77,7 +76,6 @@ def train(
     *,
     validation: list[Path] | None = None,
     cache: Path | None = None,
-    initial_weights: Path | None = None,
     accelerator: str = "cpu",
     checkpoint_every: int = 500,
     credits: str = "",
@@ -101,7 +99,6 @@ def train(
         validation: folders of sequences that are used for validation only.
         cache: folder of the decoded sequences, which several runs may use; ``out/cache`` by default. It may be deleted
             after the run.
-        initial_weights: weights to start from instead of random ones, such as those of an earlier run.
         accelerator: ``"cpu"`` or ``"cuda"``.
         checkpoint_every: number of steps between checkpoints and validations.
         credits: authors and licences of the training scenes, stored with the weights.
@@ -118,7 +115,7 @@ def train(
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
     torch.manual_seed(config.seed)
-    network, settings, start = begun(config, initial_weights)
+    network, settings, start = begun(config)
     front, rest = split(network)
     run, settled = RunFolder(out), dataclasses.asdict(config)
     run.check(config=settled)
@@ -128,15 +125,14 @@ def train(
     identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
-    output, state = _tried(config.model, rest, first_clip, fabric)
-    losses = stage_weights(config.loss_weights, output)
+    has_state = _tried(config.model, rest, first_clip, fabric)
     network.train()
     # Only now, so that invalid input does not leave files of a run.
     if fabric.is_global_zero:
         run.claim(config=settled, data=identity)
     fabric.barrier()
 
-    trainer = Trainer(config, network, fabric, losses, has_state=state is not None)
+    trainer = Trainer(config, network, fabric, has_state=has_state)
     first, provenance = run.load(*trainer.parts)
     weights = out / f"{config.model.rpartition(':')[2]}.safetensors"
     if first == config.steps and weights.exists():
@@ -153,8 +149,10 @@ def train(
     return weights
 
 
-def begun(config: TrainConfig, weights: Path | None = None) -> tuple[Any, dict[str, Any], str]:
+def begun(config: TrainConfig) -> tuple[Any, dict[str, Any], str]:
     """The model in training mode, its settings, and the checksum of the weights that it begins with."""
+    first = parse_method(config.start_from) if config.start_from else None
+    weights = None if first is None else first.weights
     start: dict[str, Any] = describe_weights(weights) if weights else {"settings": {}, "sha256": "none"}
     settings: dict[str, Any] = {**start["settings"], **config.model_settings}
     # Typed as both model and module.
@@ -162,16 +160,13 @@ def begun(config: TrainConfig, weights: Path | None = None) -> tuple[Any, dict[s
     if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
         raise InputError(f"model '{config.model}': expected one that learns, found one without weights")
     network: Any = model.train()
-    if config.start_from:
-        if weights is not None:
-            raise InputError("start_from: expected none beside initial weights, found both; leave one out")
-        method = parse_method(config.start_from)
-        start["sha256"] = start_with(network, method.model, **method.settings)
+    if first is not None and weights is None:
+        start["sha256"] = start_with(network, first.model, **first.settings)
     return network, settings, start["sha256"]
 
 
-def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
-    """Run the model on the first frames of a clip, so that errors show before the run begins."""
+def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> bool:
+    """Run the model on the first frames of a clip, so that errors show before the run begins: has it a state?"""
     state: State = None
     try:
         with torch.no_grad(), fabric.autocast():
@@ -188,7 +183,7 @@ def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output,
         if image.shape != frame.color.shape:
             sizes = f"of {tuple(frame.color.shape)}, found {tuple(image.shape)}"
             raise InputError(f"model '{name}': expected the stage '{stage}' {sizes}")
-    return output, state
+    return state is not None
 
 
 class Trainer:
@@ -198,14 +193,11 @@ class Trainer:
         config: configuration of the run.
         network: network in training mode, without the front, which the clips have passed.
         fabric: devices.
-        losses: weights of the loss by stage.
         has_state: whether the model has a state.
     """
 
-    def __init__(
-        self, config: TrainConfig, network: Any, fabric: Fabric, losses: Mapping[str, float], *, has_state: bool
-    ) -> None:
-        self.config, self.fabric, self.losses = config, fabric, dict(losses)
+    def __init__(self, config: TrainConfig, network: Any, fabric: Fabric, *, has_state: bool) -> None:
+        self.config, self.fabric = config, fabric
         self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
@@ -243,7 +235,6 @@ class Trainer:
         loss = stage_loss(
             output,
             clip["reference"],
-            self.losses,
             loss=self.config.loss,
             temporal_weight=self.config.temporal_weight,
             display_weight=self.config.display_weight,
@@ -272,7 +263,7 @@ class Trainer:
         result = self.result
         training = result.training
         result.eval()
-        scores = validate(split(result)[1], self.losses, data.watched, self.fabric, board, step)
+        scores = validate(split(result)[1], data.watched, self.fabric, board, step)
         result.train(training)
         return scores
 
