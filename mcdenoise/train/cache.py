@@ -14,9 +14,8 @@ import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -25,59 +24,44 @@ from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError
 from mcdenoise.train.shots import Array
 
+# Maps the arrays of a name; computes them by the function and writes them before, if necessary.
+Keep: TypeAlias = Callable[[str, Callable[[], Mapping[str, Array]]], dict[str, Array]]
 
-@dataclass(frozen=True)
-class Cache:
-    """The arrays of a sequence.
+
+def open_cache(sequence: Sequence, settings: list[Any], folder: Path) -> Keep:
+    """The cached arrays of a sequence: a function that takes their name and one that computes them.
+
+    If another process is computing the arrays of a sequence, it waits. If they cannot be written, it raises an
+    ``InputError``, and no incomplete files are left.
 
     Args:
-        place: folder of the sequence in the cache.
-        key: checksum of everything that the arrays depend on.
+        sequence: the sequence.
+        settings: everything else that its arrays depend on, in JSON types.
+        folder: folder of the whole cache; created if it does not exist.
     """
+    settings = [sequence.numbers, *settings]
+    identity = _digest([str(sequence.root.resolve()), *settings])[:16]
+    key = _digest([*settings, _code(), _state(sequence)])
+    return functools.partial(_kept, folder / f"{sequence.name[:100]}-{identity}", key)
 
-    place: Path
-    key: str
 
-    @staticmethod
-    def of(sequence: Sequence, settings: list[Any], folder: Path) -> Cache:
-        """The cache of a sequence.
-
-        Args:
-            sequence: the sequence.
-            settings: everything else that its arrays depend on, in JSON types.
-            folder: folder of the whole cache.
-        """
-        settings = [sequence.numbers, *settings]
-        identity = _digest([str(sequence.root.resolve()), *settings])[:16]
-        key = _digest([*settings, _code(), _state(sequence)])
-        return Cache(folder / f"{sequence.name[:100]}-{identity}", key)
-
-    def arrays(self, name: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
-        """Map arrays, and compute and write them before if necessary; if another process does that, wait for it.
-
-        Args:
-            name: name of the arrays' folder.
-            make: computes the arrays.
-
-        Raises:
-            InputError: they cannot be written; then no incomplete files are left.
-        """
-        place = self.place / name
-        if (found := _mapped(place, self.key)) is None:
-            with locked(self.place):
-                # Another process may have done the work while this one waited.
-                if (found := _mapped(place, self.key)) is None:
-                    shutil.rmtree(place, ignore_errors=True)
-                    arrays = make()
-                    with new_folder(place) as building:
-                        for each, array in arrays.items():
-                            np.save(building / f"{each}.npy", array, allow_pickle=False)
-                        files = {path.name: _checksum(path) for path in sorted(building.iterdir())}
-                        (building / "about.json").write_text(json.dumps({"key": self.key, "files": files}) + "\n")
-                    found = _mapped(place, self.key)
-        if found is None:
-            raise InputError(f"{place}: expected the arrays just written, found them damaged; check the disk")
-        return found
+def _kept(folder: Path, key: str, name: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
+    place = folder / name
+    if (found := _mapped(place, key)) is None:
+        with locked(folder):
+            # Another process may have done the work while this one waited.
+            if (found := _mapped(place, key)) is None:
+                shutil.rmtree(place, ignore_errors=True)
+                arrays = make()
+                with new_folder(place) as building:
+                    for each, array in arrays.items():
+                        np.save(building / f"{each}.npy", array, allow_pickle=False)
+                    files = {path.name: _checksum(path) for path in sorted(building.iterdir())}
+                    (building / "about.json").write_text(json.dumps({"key": key, "files": files}) + "\n")
+                found = _mapped(place, key)
+    if found is None:
+        raise InputError(f"{place}: expected the arrays just written, found them damaged; check the disk")
+    return found
 
 
 @contextmanager

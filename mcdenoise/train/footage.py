@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models._motion import motion_to_previous
-from mcdenoise.train.cache import Cache
+from mcdenoise.train.cache import Keep, open_cache
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Array, Shot
 
@@ -106,18 +106,18 @@ def shots_of(
     every = start_every if front.accumulates and start_every else length
     later = [start for start in range(every, length, every) if length - held - start >= frames]
     read: Callable[[int], Mapping[str, Array]]
+    keep: Keep = _as_halves
     if isinstance(source, Shard):
         seeds, references, digest = 1, source.references, source.digest
         if front.accumulates and references < length:
             first = max(length - frames, 0)
             later = later and [later[int(digest, 16) % len(later)]]
-        read, keep = functools.partial(_packed, source, None if front.wrappers else wanted), _as_halves
+        read = functools.partial(_packed, source, None if front.wrappers else wanted)
     else:
         seeds, references = min(noise_seeds or source.noise_seeds, source.noise_seeds), length
-        own = Cache.of(source, [front.settings, sorted(wanted), noise_seeds], cache)
-        decode = functools.partial(_decoded, source, wanted, seeds, keep_all=bool(front.wrappers))
-        arrays = own.arrays("frames", decode)
-        read, keep, digest = functools.partial(_of_seed, arrays), own.arrays, arrays["sha256"].tobytes().hex()
+        keep = open_cache(source, [front.settings, sorted(wanted), noise_seeds], cache)
+        arrays = keep("frames", functools.partial(_decoded, source, wanted, seeds, keep_all=bool(front.wrappers)))
+        read, digest = functools.partial(_of_seed, arrays), arrays["sha256"].tobytes().hex()
 
     def handed(start: int, noise_seed: int) -> dict[str, Array]:
         buffers = read(noise_seed)

@@ -21,14 +21,7 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path, held
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
-from mcdenoise.models import (
-    Model,
-    State,
-    create_model,
-    describe_weights,
-    save_weights,
-    start_with,
-)
+from mcdenoise.models import Model, State, create_model, describe_weights, save_weights, start_with
 from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.train.cache import writing
 from mcdenoise.train.clips import Clip
