@@ -92,12 +92,12 @@ def _mapped(place: Path, key: str) -> dict[str, Array] | None:
     """Map the arrays; return ``None`` if they are missing, stale or damaged, as their checksums tell."""
     try:
         about = json.loads((place / "about.json").read_text())
-        if about["key"] != key or any(_checksum(place / name) != own for name, own in about["files"].items()):
+        if about != {"key": key, "files": {path.name: _checksum(path) for path in place.glob("*.npy")}}:
             return None
         # Plain views, because slicing a memmap takes longer than reading.
         maps = {name: np.load(place / name, mmap_mode="r", allow_pickle=False) for name in about["files"]}
         return {name.removesuffix(".npy"): array.view(np.ndarray) for name, array in maps.items()}
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, EOFError, ValueError, RecursionError):
         return None
 
 
