@@ -29,7 +29,7 @@ from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
 from mcdenoise.models import DEFAULT, Model
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
-from mcdenoise.train.packed import frame_of
+from mcdenoise.train.footage import frame_of
 
 # Errors by take, method and metric.
 Rows: TypeAlias = dict[str, dict[str, dict[str, float]]]

@@ -32,7 +32,7 @@ from mcdenoise.models._precision import Precision
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import check_config
-from mcdenoise.train.data import DataFolders
+from mcdenoise.train.data import TrainingData
 from mcdenoise.train.devices import open_fabric
 from mcdenoise.train.front import split
 from mcdenoise.train.loop import Trainer
@@ -51,7 +51,8 @@ def noise(config: TrainConfig) -> ClipSampler:
 
     shot = {"color": uniform(3), "current": uniform(3), "length": np.ceil(8 * uniform(1)).clip(1)}
     shot |= {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
-    return ClipSampler([Shot.of(shot, demodulated=True)], config.frames, config.crop)
+    random = Shot((lambda: shot,), range(config.frames), (config.crop, config.crop), demodulated=True)
+    return ClipSampler([random], config.frames, config.crop)
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
@@ -60,7 +61,7 @@ def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:
         return noise(config)
     front, rest = split(create_model(config.model))
     with tempfile.TemporaryDirectory() as cache:
-        return DataFolders.open(config, front, rest.needs, sequences, []).load(Path(cache)).sampler
+        return TrainingData.load(config, front, rest.needs, sequences, [], Path(cache)).sampler
 
 
 def config_of(model: str, precision: Precision, batch: int, frames: int, crop: int) -> TrainConfig:
@@ -81,8 +82,7 @@ def steps(config: TrainConfig, sampler: ClipSampler, device: str = "cpu") -> Cal
     """A function that makes the next training step and returns its loss; all start from the same weights."""
     torch.manual_seed(config.seed)
     fabric = open_fabric(device, config.precision, config.batch)
-    losses = {"image": 1.0, "initial": 1.0}
-    trainer = Trainer(config, create_model(config.model).train(), fabric, losses, has_state=False)
+    trainer = Trainer(config, create_model(config.model).train(), fabric, has_state=False)
     numbers = itertools.count()
 
     def step() -> float:

@@ -21,8 +21,9 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.data.shards import Shard
 from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
+from mcdenoise.train.data import describe_takes, open_takes
+from mcdenoise.train.footage import shots_of
 from mcdenoise.train.front import Front, split
-from mcdenoise.train.packed import describe_packed, open_packed, shots_of
 
 FEATURES = frozenset({"albedo", "normal"})
 FIXED = ("current", "albedo", "normal", "reference")
@@ -62,14 +63,14 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
     """Write a part."""
     fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
     for shard in shards:
-        handed = front.of(shard.shapes), FEATURES, shard.references
-        shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)]
+        handed = front.of(shard.shapes), FEATURES, shard.references, path.parent
+        shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)[0]]
         about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(shots)}
         for place in tiles(shard.size):
             index.append(about)
             fixed.append(part_of(shots[0], FIXED, place))
             history += [part_of(shot, HISTORY, place) for shot in shots]
-    text = np.frombuffer(json.dumps({"index": index, **describe_packed(shards)}).encode(), np.uint8)
+    text = np.frombuffer(json.dumps({"index": index, **describe_takes(shards)}).encode(), np.uint8)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=text, **planes("fixed", fixed), **planes("history", history))
     print(f"{path}: {len(shards)} takes, {path.stat().st_size / 1e6:.1f} MB", flush=True)
@@ -84,7 +85,7 @@ def main() -> None:
     options = parser.parse_args()
     front, _ = split(create_model(options.model))
     options.out.mkdir(parents=True, exist_ok=True)
-    shards = open_packed(options.takes)
+    shards = open_takes(options.takes)
     for first in range(0, len(shards), options.size):
         path = options.out / f"part-{first // options.size:02}.npz"
         if not path.exists():

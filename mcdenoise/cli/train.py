@@ -32,7 +32,6 @@ def train(
     data: Path | None = None,
     validation: list[Path] = [],  # noqa: B006 - tyro reads it
     cache: Path | None = None,
-    initial_weights: Path | None = None,
     accelerator: str = "cpu",
     checkpoint_every: int = 500,
     credits: str = "",
@@ -49,7 +48,6 @@ def train(
         data: folder of the sequences that a recipe renders, which recipes may share; OUT/data by default.
         validation: folders of sequences that are used for nothing but validation.
         cache: folder of the decoded sequences, which several runs may share; OUT/cache by default.
-        initial_weights: safetensors file of weights to start from.
         accelerator: cpu or cuda; for several devices or machines start the command with torchrun.
         checkpoint_every: steps between checkpoints.
         credits: authors and licences of the training scenes, stored with the weights.
@@ -59,7 +57,6 @@ def train(
     if recipe is not None:
         changed = [each.name for each in dataclasses.fields(config) if getattr(config, each.name) != each.default]
         others: dict[str, object] = {"SEQUENCES": sequences, "--validation": validation, "--credits": credits}
-        others["--initial-weights"] = initial_weights
         given = [name for name, value in others.items() if value]
         for name in [*given, *(f"--{name.replace('_', '-')}" for name in changed)]:
             raise InputError(f"{name}: expected none beside --recipe, which says what is trained, found one")
@@ -88,7 +85,6 @@ def train(
             out / one.name,
             validation=validation,
             cache=cache or out / "cache",
-            initial_weights=initial_weights,
             accelerator=accelerator,
             checkpoint_every=checkpoint_every,
             credits=credits,

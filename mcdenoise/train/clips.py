@@ -20,7 +20,6 @@ from mcdenoise.train.shots import Array, Shot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
 
-
 # Buffers of radiance, of reflectance, and of world-space vectors, whose channels can be permuted.
 LIGHT = frozenset({*RADIANCE, "reference", NOISY, OIDN, OIDN_CLEAN})
 _COLORED = LIGHT | {"albedo", OIDN_ALBEDO, "specular_albedo", "variance"}
@@ -37,11 +36,6 @@ class Clip:
     """
 
     buffers: dict[str, Tensor]
-
-    @staticmethod
-    def of(shot: dict[str, Tensor]) -> Clip:
-        """A clip with a batch of one from the result of :meth:`mcdenoise.train.shots.Shot.read`."""
-        return Clip({name: buffer[None] for name, buffer in shot.items()})
 
     def __getitem__(self, name: str) -> Tensor:
         return self.buffers[name]

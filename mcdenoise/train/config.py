@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.methods import parse_method
 from mcdenoise.models import DEFAULT
 from mcdenoise.models._precision import Precision
 from mcdenoise.train.losses import Loss
@@ -37,12 +37,10 @@ class TrainConfig:
         model: a name in the zoo, or your own path/to/file.py:factory or package.module:factory.
         settings: arguments of the model's constructor, such as width=16,cascade=K+P.
         start_from: a model with weights, which the layers of the same names start with, such as wild or
-            oidn_open(quality=fast); all by default start with random weights.
-        losses: weights of the result and of intermediate stages in the loss, such as image=1,initial=0.5; by default 1
-            for the result and for the stage initial, if the model has one.
+            oidn_open(quality=fast), or a file of weights of an earlier run, such as run/wild.safetensors; all by
+            default start with random weights.
         loss: loss of a clip, one of mcdenoise.train.losses.LOSSES: smape, the paper's; l1_display, that of Meng et
-            al. 2020; rae, that of Chaitanya et al. 2017, whose later frames count more; or oidn, that of Open Image
-            Denoise.
+            al. 2020; or rae, that of Chaitanya et al. 2017, whose later frames count more.
         steps: optimiser steps.
         batch: clips in a step, of all processes together.
         frames: frames in a clip.
@@ -70,7 +68,6 @@ class TrainConfig:
     model: str = DEFAULT
     settings: str = ""
     start_from: str = ""
-    losses: str = ""
     loss: Loss = "smape"
     steps: _Count = 10_000
     batch: _Count = 8
@@ -98,20 +95,12 @@ class TrainConfig:
         Raises:
             InputError: the settings have another form.
         """
-        return parse_settings("settings", self.settings)
-
-    @property
-    def loss_weights(self) -> dict[str, float]:
-        """The requested weights of the loss by stage.
-
-        Raises:
-            InputError: a weight is not a number.
-        """
-        found = parse_settings("losses", self.losses)
-        for stage, weight in found.items():
-            if isinstance(weight, bool) or not isinstance(weight, int | float):
-                raise InputError(f"losses: expected weights such as image=1,initial=0.5, found {stage}={weight}")
-        return found
+        try:
+            return parse_method(f"model({self.settings})").settings
+        except InputError as error:
+            raise InputError(
+                f"settings: expected NAME=VALUE,... with each name once, found '{self.settings}'"
+            ) from error
 
     def rate(self, step: int) -> float:
         """The learning rate of a step relative to the highest one."""
@@ -151,30 +140,4 @@ def check_config(config: TrainConfig, checkpoint_every: int) -> None:
             raise InputError(f"{name}: expected at least {low}, found {getattr(config, name)}")
     if checkpoint_every < 1:
         raise InputError(f"checkpoint_every: expected at least 1, found {checkpoint_every}")
-    _ = config.model_settings, config.loss_weights
-
-
-def parse_settings(name: str, text: str) -> dict[str, Any]:
-    """Parse settings such as ``width=16,cascade=K+P,bilateral=false``: numbers, true, false, none, or strings.
-
-    Args:
-        name: name of the option, for the message.
-        text: settings separated by commas; may be empty.
-
-    Raises:
-        InputError: a part is not a setting, or a setting is given twice.
-
-    Example:
-        >>> parse_settings("settings", "width=16, cascade=K+P, alpha_min=0.2, bilateral=false")
-        {'width': 16, 'cascade': 'K+P', 'alpha_min': 0.2, 'bilateral': False}
-    """
-    found: dict[str, Any] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        key, equals, value = (each.strip() for each in part.partition("="))
-        if not (key and equals) or key in found:
-            raise InputError(f"{name}: expected NAME=VALUE,... with each name once, found '{text}'")
-        try:
-            found[key] = json.loads({"none": "null"}.get(value.lower(), value.lower()))
-        except ValueError:
-            found[key] = value
-    return found
+    _ = config.model_settings

@@ -2,68 +2,42 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence as Sequential
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from mcdenoise.data import Sequence, open_sequence
-from mcdenoise.data.shards import Shard, find_shards
+from mcdenoise.data.shards import Shard, find_shards, open_shard
 from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
-from mcdenoise.train.cache import features_of, open_cached
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
+from mcdenoise.train.footage import FEATURES, Source, check_trainable, features_of, shots_of
 from mcdenoise.train.front import Front
-from mcdenoise.train.packed import check_packed, describe_packed, features_of_shard, open_packed, shots_of
 from mcdenoise.train.shots import Shot
-
-# Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
-_FEATURES = ("albedo", "normal", "depth")
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Sequences that are ready for training.
+    """Frames that are ready for training.
 
     Args:
         sampler: draws the training clips.
         watched: name and frames of each sequence to validate on.
-        description: description of every sequence that identifies its pixels.
+        description: description of all frames that identifies their pixels.
     """
 
     sampler: ClipSampler
     watched: list[tuple[str, Shot]]
     description: dict[str, Any]
 
-
-@dataclass(frozen=True)
-class DataFolders:
-    """Sequences that have the buffers for training, as far as headers tell.
-
-    Args:
-        config: configuration of the run.
-        front: the wrappers that process the frames before training.
-        features: names of the buffers without noise to train on.
-        training: sequences to train on, except for their validation frames.
-        validation: sequences that are used for validation only.
-        packed: packed takes to train on.
-        packed_validation: packed takes that are used for validation only.
-    """
-
-    config: TrainConfig
-    front: Front
-    features: frozenset[str]
-    training: list[Sequence]
-    validation: list[Sequence]
-    packed: list[Shard]
-    packed_validation: list[Shard]
-
     @staticmethod
-    def open(
-        config: TrainConfig, front: Front, needs: Needs, training: list[Path], validation: list[Path]
-    ) -> DataFolders:
-        """Open the folders.
+    def load(
+        config: TrainConfig, front: Front, needs: Needs, training: list[Path], validation: list[Path], cache: Path
+    ) -> TrainingData:
+        """Open the folders, and decode and process the sequences that are not in the cache yet.
 
         Args:
             config: configuration of the run.
@@ -71,95 +45,70 @@ class DataFolders:
             needs: needs of the rest of the model.
             training: folders to train on: sequences, or folders of packed takes.
             validation: folders to validate on only.
+            cache: folder of the decoded sequences.
 
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
-                frames are missing within a sequence, no sequence is long enough, or one is smaller than the crop.
+                frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, a file
+                is damaged, or the cache cannot be written.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
-        packed = [open_packed(paths) for paths in (training, validation)]
-        opened = [[open_sequence(path) for path in paths if not find_shards(path)] for paths in (training, validation)]
-        both, takes = [*opened[0], *opened[1]], [*packed[0], *packed[1]]
-        common = frozenset.intersection(*map(features_of, both), *map(features_of_shard, takes))
+        takes, watched_takes = open_takes(training), open_takes(validation)
+        sequences, watched_sequences = (
+            [open_sequence(path) for path in paths if not find_shards(path)] for paths in (training, validation)
+        )
+        sources: list[Source] = [*sequences, *watched_sequences, *takes, *watched_takes]
+        common = frozenset.intersection(*map(features_of, sources))
         front = front.of((needs.buffers | needs.uses) & common)
-        # The cache does not store single samples: methods that take samples are trained on their mean.
+        # Single samples are not kept: methods that take samples are trained on their mean.
         used = (needs.buffers | needs.uses) - front.parts.keys() - {"samples"}
-        wanted = needs.buffers - front.parts.keys() | (used & set(_FEATURES))
-        for sequence in both:
-            _check_trainable(sequence, wanted)
-        check_packed(takes, wanted)
-        features = used & common
-        folders = DataFolders(config, front, features, opened[0], opened[1], packed[0], packed[1])
-        lengths = [(len(s) - len(folders._held_out(s)), s.size) for s in folders.training]
-        lengths += [(len(shard), shard.size) for shard in folders.packed]
-        check_sizes(lengths, config.frames, config.crop)
-        return folders
+        for source in sources:
+            check_trainable(source, needs.buffers - front.parts.keys() | (used & set(FEATURES)))
+        # The last frames of a sequence are kept for validation, unless too few would remain.
+        least, held = config.frames + config.validation_frames, [0] * len(takes)
+        held += [config.validation_frames if len(sequence) >= least else 0 for sequence in sequences]
+        both: list[tuple[Source, int]] = list(zip([*takes, *sequences], held, strict=True))
+        check_sizes([(len(source) - kept, source.size) for source, kept in both], config.frames, config.crop)
 
-    def load(self, cache: Path) -> TrainingData:
-        """Decode and accumulate the sequences that are not in the cache yet.
-
-        Raises:
-            InputError: a file is damaged, or the cache cannot be written.
-        """
-        config = self.config
-        handed = self.front, self.features, config.frames
-        shots: list[Shot] = [shot for each in self.packed for shot in shots_of(each, *handed, config.start_every)]
+        handed = front, used & common, config.frames, cache
+        shots: list[Shot] = []
         watched: list[tuple[str, Shot]] = []
-        entries: list[dict[str, Any]] = []
-        for sequence in self.training:
-            held = self._held_out(sequence)
-            length = len(sequence) - len(held)
-            # A clip may begin anywhere in a shot; further first frames only provide shorter histories.
-            firsts = range(0, len(sequence), config.start_every if self.front.accumulates else len(sequence))
-            # Skip a shot without room for a clip, except the first one, which carries the checksum.
-            useful = [first for first in firsts if first == 0 or length - first >= config.frames]
-            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=useful)
-            shots += [shot.cut(slice(length - first)) for first, shot in zip(useful, cached.shots, strict=True)]
-            if held:
-                watched.append((sequence.name, cached.shots[0].cut(slice(length, None))))
-            about = {"noise_seeds": cached.shots[0].noise_seeds, "validation": held}
-            entries.append(_describe(sequence, cached.sha256, **about))
-        description: dict[str, Any] = {"sequences": entries}
-        if self.packed:
-            description["packed"] = describe_packed(self.packed)
-        for sequence in self.validation:
-            cached = open_cached(sequence, cache, front=self.front, features=self.features, firsts=[0], noise_seeds=1)
-            watched.append((sequence.name, cached.shots[0]))
-            description.setdefault("validation_sequences", []).append(_describe(sequence, cached.sha256))
-        watched += [(each.path.name, shot) for each in self.packed_validation for shot in shots_of(each, *handed)]
-        if self.packed_validation:
-            description["packed_validation"] = describe_packed(self.packed_validation)
+        description: dict[str, Any] = {"sequences": []}
+        for source, kept in both:
+            whole, digest = shots_of(source, *handed, start_every=config.start_every, held=kept)
+            shots += [shot.cut(slice(len(shot) - kept)) for shot in whole]
+            if isinstance(source, Sequence):
+                watched += [(source.name, whole[0].cut(slice(-kept, None)))] if kept else []
+                own = {"noise_seeds": source.noise_seeds, "validation": source.numbers[len(source) - kept :]}
+                description["sequences"].append(_describe(source, digest, **own))
+        others: list[Source] = [*watched_sequences, *watched_takes]
+        for source in others:
+            (shot, *_), digest = shots_of(source, *handed, noise_seeds=1)
+            watched.append((source.name if isinstance(source, Sequence) else source.path.name, shot))
+            if isinstance(source, Sequence):
+                description.setdefault("validation_sequences", []).append(_describe(source, digest))
+        for name, shards in {"packed": takes, "packed_validation": watched_takes}.items():
+            description |= {name: describe_takes(shards)} if shards else {}
         light = {"key": config.key, "exposure": config.exposure, "tint": config.tint}
         sampler = ClipSampler(shots, config.frames, config.crop, lamps=config.lamps, **light)
         return TrainingData(sampler, watched, description)
 
-    def _held_out(self, sequence: Sequence) -> list[int]:
-        """Numbers of the last frames, kept for validation; none if too few frames would remain."""
-        enough = len(sequence) >= self.config.frames + self.config.validation_frames
-        return sequence.numbers[len(sequence) - self.config.validation_frames :] if enough else []
+
+def open_takes(paths: Sequential[Path]) -> list[Shard]:
+    """The packed takes of these files and folders; the paths of anything else are left out."""
+    return [open_shard(file) for path in paths for file in find_shards(path)]
+
+
+def describe_takes(takes: Sequential[Shard]) -> dict[str, Any]:
+    """What identifies the pixels of packed takes, and whom they are owed to."""
+    digest = hashlib.sha256("".join(take.digest for take in takes).encode()).hexdigest()
+    owed = {str(line) for take in takes for line in take.header.get("credits", [])}
+    # Each line is a name with author and licence in parentheses.
+    authors = sorted({line.partition(" (")[2].rstrip(")") for line in owed})
+    return {"takes": len(takes), "sha256": digest, "credits": authors}
 
 
 def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:
     size = f"{sequence.size[1]}x{sequence.size[0]}"
     return {"name": sequence.name, "frames": len(sequence), "size": size, **more, "sha256": sha256}
-
-
-def _check_trainable(sequence: Sequence, wanted: frozenset[str]) -> None:
-    """Check that headers of a sequence show everything that training needs."""
-    missing = sorted(wanted - features_of(sequence))
-    if missing:
-        names = ", ".join([*(name for name in _FEATURES if name in wanted), *sorted(wanted - set(_FEATURES))])
-        raise InputError(f"{sequence.root}: expected {names} to train this model on, found no {missing[0]}")
-    for one, following in pairwise(sequence.numbers):
-        if following != one + 1:
-            raise InputError(
-                f"{sequence.root}: expected frame {one + 1} after frame {one}, found {following}; a clip to train on "
-                "has no gaps: render it, or keep the frames of each run in a folder of their own"
-            )
-    without = sorted(set(sequence.numbers) - set(sequence.reference_numbers))
-    if without:
-        raise InputError(
-            f"{sequence.root}: expected a reference for every frame to train on, found none for frame {without[0]}; "
-            "render it, or train on other sequences"
-        )

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,25 +18,18 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mcdenoise.commit import source_commit
-from mcdenoise.data.files import atomic_path
+from mcdenoise.data.files import atomic_path, held
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
-from mcdenoise.models import (
-    Model,
-    Output,
-    State,
-    create_model,
-    describe_weights,
-    save_weights,
-    start_with,
-)
+from mcdenoise.models import Model, State, create_model, describe_weights, save_weights, start_with
 from mcdenoise.models._defaults import plain_defaults
+from mcdenoise.train.cache import writing
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
-from mcdenoise.train.data import DataFolders, TrainingData
+from mcdenoise.train.data import TrainingData
 from mcdenoise.train.devices import open_fabric
 from mcdenoise.train.front import split
-from mcdenoise.train.losses import stage_loss, stage_weights
+from mcdenoise.train.losses import stage_loss
 from mcdenoise.train.run_folder import Provenance, RunFolder, about_weights
 from mcdenoise.train.unroll import Unrolled
 from mcdenoise.train.validation import validate
@@ -76,7 +69,6 @@ def train(
     *,
     validation: list[Path] | None = None,
     cache: Path | None = None,
-    initial_weights: Path | None = None,
     accelerator: str = "cpu",
     checkpoint_every: int = 500,
     credits: str = "",
@@ -100,7 +92,6 @@ def train(
         validation: folders of sequences that are used for validation only.
         cache: folder of the decoded sequences, which several runs may use; ``out/cache`` by default. It may be deleted
             after the run.
-        initial_weights: weights to start from instead of random ones, such as those of an earlier run.
         accelerator: ``"cpu"`` or ``"cuda"``.
         checkpoint_every: number of steps between checkpoints and validations.
         credits: authors and licences of the training scenes, stored with the weights.
@@ -117,34 +108,31 @@ def train(
     check_config(config, checkpoint_every)
     fabric = open_fabric(accelerator, config.precision, config.batch)
     torch.manual_seed(config.seed)
-    network, settings, start = begun(config, initial_weights)
+    network, settings, start = begun(config)
     front, rest = split(network)
-    folders = DataFolders.open(config, front, rest.needs, sequences, validation or [])
-
     run, settled = RunFolder(out), dataclasses.asdict(config)
     run.check(config=settled)
     with fabric.rank_zero_first():
-        data = folders.load(cache or out / "cache")
+        data = TrainingData.load(config, front, rest.needs, sequences, validation or [], cache or out / "cache")
     identity = {"credits": credits, "initial_weights": start, **data.description}
     identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
-    output, state = _tried(config.model, rest, first_clip, fabric)
-    losses = stage_weights(config.loss_weights, output)
+    has_state = _tried(config.model, rest, first_clip, fabric)
     network.train()
     # Only now, so that invalid input does not leave files of a run.
     if fabric.is_global_zero:
         run.claim(config=settled, data=identity)
     fabric.barrier()
 
-    trainer = Trainer(config, network, fabric, losses, has_state=state is not None)
+    trainer = Trainer(config, network, fabric, has_state=has_state)
     first, provenance = run.load(*trainer.parts)
     weights = out / f"{config.model.rpartition(':')[2]}.safetensors"
     if first == config.steps and weights.exists():
         return weights
     # The source tree may change between interruptions of the run.
     provenance.append({"first_step": first, "commit": source_commit()})
-    with _writing(out), run.held() if fabric.is_global_zero else nullcontext():
+    with writing(out), held(out, "training") if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
             about = about_weights(settled, identity, config.steps, provenance)
@@ -154,8 +142,10 @@ def train(
     return weights
 
 
-def begun(config: TrainConfig, weights: Path | None = None) -> tuple[Any, dict[str, Any], str]:
+def begun(config: TrainConfig) -> tuple[Any, dict[str, Any], str]:
     """The model in training mode, its settings, and the checksum of the weights that it begins with."""
+    first = parse_method(config.start_from) if config.start_from else None
+    weights = None if first is None else first.weights
     start: dict[str, Any] = describe_weights(weights) if weights else {"settings": {}, "sha256": "none"}
     settings: dict[str, Any] = {**start["settings"], **config.model_settings}
     # Typed as both model and module.
@@ -163,16 +153,13 @@ def begun(config: TrainConfig, weights: Path | None = None) -> tuple[Any, dict[s
     if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
         raise InputError(f"model '{config.model}': expected one that learns, found one without weights")
     network: Any = model.train()
-    if config.start_from:
-        if weights is not None:
-            raise InputError("start_from: expected none beside initial weights, found both; leave one out")
-        method = parse_method(config.start_from)
-        start["sha256"] = start_with(network, method.model, **method.settings)
+    if first is not None and weights is None:
+        start["sha256"] = start_with(network, first.model, **first.settings)
     return network, settings, start["sha256"]
 
 
-def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output, State]:
-    """Run the model on the first frames of a clip, so that errors show before the run begins."""
+def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> bool:
+    """Run the model on the first frames of a clip, so that errors show before the run begins: has it a state?"""
     state: State = None
     try:
         with torch.no_grad(), fabric.autocast():
@@ -189,7 +176,7 @@ def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> tuple[Output,
         if image.shape != frame.color.shape:
             sizes = f"of {tuple(frame.color.shape)}, found {tuple(image.shape)}"
             raise InputError(f"model '{name}': expected the stage '{stage}' {sizes}")
-    return output, state
+    return state is not None
 
 
 class Trainer:
@@ -199,14 +186,11 @@ class Trainer:
         config: configuration of the run.
         network: network in training mode, without the front, which the clips have passed.
         fabric: devices.
-        losses: weights of the loss by stage.
         has_state: whether the model has a state.
     """
 
-    def __init__(
-        self, config: TrainConfig, network: Any, fabric: Fabric, losses: Mapping[str, float], *, has_state: bool
-    ) -> None:
-        self.config, self.fabric, self.losses = config, fabric, dict(losses)
+    def __init__(self, config: TrainConfig, network: Any, fabric: Fabric, *, has_state: bool) -> None:
+        self.config, self.fabric = config, fabric
         self.network = network.to(memory_format=torch.channels_last)
         self.optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, config.rate)
@@ -244,7 +228,6 @@ class Trainer:
         loss = stage_loss(
             output,
             clip["reference"],
-            self.losses,
             loss=self.config.loss,
             temporal_weight=self.config.temporal_weight,
             display_weight=self.config.display_weight,
@@ -273,7 +256,7 @@ class Trainer:
         result = self.result
         training = result.training
         result.eval()
-        scores = validate(split(result)[1], self.losses, data.watched, self.fabric, board, step)
+        scores = validate(split(result)[1], data.watched, self.fabric, board, step)
         result.train(training)
         return scores
 
@@ -353,13 +336,3 @@ def _quiet_threads() -> Iterator[None]:
         yield
     finally:
         threading.excepthook = before
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    """Convert errors of the operating system to an ``InputError``."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{out}: cannot be written ({reason}); check its permissions and free space") from error

@@ -96,18 +96,14 @@ class Rendering:
         """
         place = self.folder(data)
         finished = place / "finished.json"
-        try:
-            with locked(place):
-                if not finished.exists():
-                    generate()
-                    write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
-                sequences = find_shards(place) or sorted(path for path in place.iterdir() if path.is_dir())
-                if self.clean:
-                    out = place.with_name(f"{place.name}-clean")
-                    sequences = [clean_references(sequence, out) for sequence in sequences]
-        except OSError as error:
-            reason = error.strerror or type(error).__name__
-            raise InputError(f"{place}: cannot be rendered to ({reason}); check permissions and free space") from error
+        with locked(place):
+            if not finished.exists():
+                generate()
+                write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
+            sequences = find_shards(place) or sorted(path for path in place.iterdir() if path.is_dir())
+            if self.clean:
+                out = place.with_name(f"{place.name}-clean")
+                sequences = [clean_references(sequence, out) for sequence in sequences]
         return sequences
 
 

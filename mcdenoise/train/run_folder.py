@@ -8,14 +8,15 @@ import json
 import math
 import os
 import reprlib
-from contextlib import AbstractContextManager
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 
-from mcdenoise.data.files import atomic_path, held, json_text, write_text
+from mcdenoise.data.files import atomic_path, json_text, make_folder, write_json, write_text
 from mcdenoise.errors import InputError, is_unicode
 from mcdenoise.reading import read_bytes, read_text
 
@@ -63,23 +64,12 @@ class RunFolder:
         Raises:
             InputError: the folder cannot be written to, or belongs to another run.
         """
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.out}: expected a folder to write the run to: {error.strerror}") from error
+        make_folder(self.out)
         self.check(**identity)
         for name, content in identity.items():
             path = self.out / f"{name}.json"
             if not os.path.lexists(path):
-                write_text(path, _json(content))
-
-    def held(self) -> AbstractContextManager[None]:
-        """Lock the folder for this process; the lock is released when the process ends in any way.
-
-        Raises:
-            InputError: another process holds the lock; the message names it.
-        """
-        return held(self.out, "training")
+                write_json(path, content)
 
     def save(self, step: int, provenance: Provenance, *parts: Any) -> None:
         """Replace the checkpoint: the number of finished steps, and the states of model, optimizer and scheduler.
@@ -129,35 +119,37 @@ class RunFolder:
             file.write(json_text(entry) + "\n")
 
     def errors(self) -> dict[str, float]:
-        """The errors of the last validation; empty if there was none.
+        """The errors of the last validation, NaN for one that is not finite; empty if there was none.
 
         Raises:
             InputError: the log cannot be read.
         """
-        path = self.out / "log.jsonl"
-        try:
-            entries = [json.loads(line) for line in read_text(path, _LARGEST).splitlines()]
-            measured = [entry["validation"] for entry in entries if entry.get("validation")]
-            return {str(name): float(error) for name, error in measured[-1].items()} if measured else {}
-        except (OSError, ValueError, AttributeError, TypeError, RecursionError) as error:
-            raise InputError(f"{path}: expected the log of this run, found none that can be read") from error
+        if not (lines := self._lines()):
+            raise InputError(f"{self.out / 'log.jsonl'}: expected the log of this run, found no line that can be read")
+        measured = [line.validation for _, line in lines if line.validation] or [{}]
+        return {name: math.nan if error is None else error for name, error in measured[-1].items()}
 
     def rewind(self, step: int) -> None:
         """Remove damaged lines, and lines of steps after ``step``, which will be repeated, from ``log.jsonl``.
-
-        The last line may be truncated, and others may hold zeros or anything else after a power failure.
 
         Raises:
             InputError: the log cannot be read or written.
         """
         path = self.out / "log.jsonl"
-        if not os.path.lexists(path):
-            return
+        if os.path.lexists(path):
+            write_text(path, "".join(f"{text}\n" for text, line in self._lines() if line.last <= step))
+
+    def _lines(self) -> list[tuple[str, _Line]]:
+        """The undamaged lines of the log: others may hold zeros or anything else after a power failure."""
+        path, found = self.out / "log.jsonl", []
         try:
             lines = read_bytes(path, _LARGEST).splitlines()
         except OSError as error:
-            raise InputError(f"{path}: expected the log of this run, found: {error.strerror}; remove it") from error
-        write_text(path, "".join(f"{line.decode()}\n" for line in lines if _last_step(line) <= step))
+            raise InputError(f"{path}: expected the log of this run, found: {error.strerror}") from error
+        for line in lines:
+            with suppress(ValueError, RecursionError, msgspec.MsgspecError):
+                found.append((line.decode(), msgspec.json.decode(line.decode(), type=_Line)))
+        return found
 
     @property
     def _checkpoint(self) -> Path:
@@ -169,13 +161,17 @@ def _sealed(content: memoryview) -> bytes:
     return hashlib.sha256(content).digest()
 
 
-def _last_step(line: bytes) -> float:
-    """The step of a log line, or the first step of a start entry; infinity if the line is damaged."""
-    try:
-        entry = json.loads(line.decode())
-        return float(entry.get("step", entry.get("first_step", math.inf)))
-    except (ValueError, AttributeError, TypeError, RecursionError, OverflowError):
-        return math.inf
+class _Line(msgspec.Struct):
+    """What is read of a line of the log: an entry of finished steps, or of a start."""
+
+    step: float | None = None
+    first_step: float = math.inf
+    validation: dict[str, float | None] = {}
+
+    @property
+    def last(self) -> float:
+        """The last finished step, or the first step of a start."""
+        return self.first_step if self.step is None else self.step
 
 
 def _difference(path: Path, content: Any) -> str:
@@ -183,10 +179,7 @@ def _difference(path: Path, content: Any) -> str:
     try:
         stored = json.loads(read_text(path, _LARGEST))
         # Numbers and tuples as a file has them.
-        wanted = json.loads(_json(content))
-        # A width was a setting of its own.
-        if path.name == "config.json" and (width := stored.pop("width", 0)):
-            stored["settings"] = ",".join(filter(None, [stored.get("settings"), f"width={width}"]))
+        wanted = json.loads(json_text(content))
         # A run of an earlier version has settings that are gone.
         names = wanted if path.name == "config.json" else {**wanted, **stored}
         other = [name for name in names if stored.get(name) != wanted.get(name)]
@@ -196,10 +189,6 @@ def _difference(path: Path, content: Any) -> str:
         return f"expected {expected} as in this run, found {found}" if other else ""
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
         return "expected the file of a run, found none that can be read"
-
-
-def _json(content: Any) -> str:
-    return json.dumps(content, indent=2) + "\n"
 
 
 def about_weights(

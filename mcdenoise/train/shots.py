@@ -33,18 +33,6 @@ class Shot:
     referenced: int = 0
     demodulated: bool = False
 
-    @staticmethod
-    def of(*noise_seeds: Mapping[str, Array], demodulated: bool = False) -> Shot:
-        """A shot of arrays, with a reference for every frame.
-
-        Args:
-            noise_seeds: for each noise seed the arrays by name.
-            demodulated: whether the radiance of the color is demodulated.
-        """
-        frames, _, height, width = noise_seeds[0]["color"].shape
-        buffers = tuple(lambda each=each: each for each in noise_seeds)
-        return Shot(buffers, range(frames), (height, width), demodulated=demodulated)
-
     def __len__(self) -> int:
         return len(self.frames)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,7 +11,7 @@ from mcdenoise.metrics import displayed, psnr_srgb, smape_linear
 from mcdenoise.models import Model, State
 from mcdenoise.ops import remodulate
 from mcdenoise.train.clips import Clip
-from mcdenoise.train.losses import RESULT
+from mcdenoise.train.losses import RESULT, seen_stages
 from mcdenoise.train.shots import Shot
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 @torch.no_grad()
 def validate(
     model: Model,
-    stages: Iterable[str],
     watched: list[tuple[str, Shot]],
     fabric: Fabric,
     board: Any,
@@ -32,7 +30,6 @@ def validate(
 
     Args:
         model: the unwrapped model; only one process validates.
-        stages: the stages in the loss.
         watched: name and frames of each sequence; the first noise seed is used. A model with a state begins without
             one.
         fabric: device and precision.
@@ -40,19 +37,19 @@ def validate(
         step: optimiser steps done.
 
     Returns:
-        SMAPE and display PSNR of the result (``smape``, ``psnr``) and of stages (``initial_smape``, ...): means over
-        each sequence's frames and then over the sequences; empty without sequences.
+        SMAPE and display PSNR of the result (``smape``, ``psnr``) and of the stage ``initial`` (``initial_smape``,
+        ``initial_psnr``): means over each sequence's frames and then over the sequences; empty without sequences.
     """
     totals: dict[str, float] = {}
     for i, (name, shot) in enumerate(watched):
         state: State = None
         for t in range(len(shot)):
-            frame = Clip.of(shot.cut(slice(t, t + 1)).read()).to(fabric.device).frame(0)
+            clip = Clip({name: buffer[None] for name, buffer in shot.read(slice(t, t + 1)).items()})
+            frame = clip.to(fabric.device).frame(0)
             with fabric.autocast():
                 output, state = model(frame, state)
-            images = {RESULT: output.image, **output.stages}
-            for stage in stages:
-                for key, score in _scores(stage, images[stage].float(), frame.reference).items():
+            for stage, image in seen_stages(output).items():
+                for key, score in _scores(stage, image.float(), frame.reference).items():
                     totals[key] = totals.get(key, 0.0) + score / shot.references / len(watched)
         noisy = frame.color
         if shot.demodulated and frame.albedo is not None:

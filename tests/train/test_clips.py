@@ -14,7 +14,12 @@ PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 def shot_of(stack: Tensor) -> Shot:
     """A shot that lies in memory, from ``(T, 17, H, W)``."""
     parts = stack.split(list(PARTS.values()), 1)
-    return Shot.of({name: part.numpy() for name, part in zip(PARTS, parts, strict=True)}, demodulated=True)
+    return in_memory(dict(zip(PARTS, parts, strict=True)), demodulated=True)
+
+
+def in_memory(buffers: dict[str, Tensor], *, demodulated: bool = False) -> Shot:
+    arrays, (frames, _, *size) = {name: buffer.numpy() for name, buffer in buffers.items()}, buffers["color"].shape
+    return Shot((lambda: arrays,), range(frames), (size[0], size[1]), demodulated=demodulated)
 
 
 def clip_of(stack: Tensor) -> Clip:
@@ -122,9 +127,9 @@ def test_motion_is_flipped_and_turned_with_the_image() -> None:
     depth = torch.stack([before, before[y, x]])[:, None]
     motion = torch.stack([torch.zeros(2, size, size), torch.stack([x - columns, y - rows]).float()])
     motion[1, :, 4, 4] = torch.inf
-    features = {"motion": motion.numpy(), "depth": depth.numpy(), "reference": torch.ones(2, 3, size, size).numpy()}
+    features = {"motion": motion, "depth": depth, "reference": torch.ones(2, 3, size, size)}
     features["color"] = features["reference"]
-    clip = ClipSampler([Shot.of(features)], 2, size).draw(list(range(40)))
+    clip = ClipSampler([in_memory(features)], 2, size).draw(list(range(40)))
     views = {tuple(view[0, 0].flatten().tolist()) for view in clip["depth"]}
     assert len(views) == 8
     for numbers, vectors in zip(clip["depth"][:, :, 0], clip["motion"][:, 1], strict=True):
@@ -145,9 +150,8 @@ def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
     position = 2 * torch.rand(3, 3, height, width) - 1
     motion = torch.stack([motion_from_position(position[t : t + 1], views[max(t - 1, 0)][None])[0] for t in range(3)])
     features = {"position": position, "motion": motion, "view_projection": views}
-    arrays = {name: value.numpy() for name, value in features.items()}
-    arrays["color"] = arrays["reference"] = torch.ones(3, 3, height, width).numpy()
-    clip = ClipSampler([Shot.of(arrays)], 3, crop).draw(list(range(40)))
+    features["color"] = features["reference"] = torch.ones(3, 3, height, width)
+    clip = ClipSampler([in_memory(features)], 3, crop).draw(list(range(40)))
     found = motion_from_position(clip["position"][:, 1].contiguous(), clip["view_projection"][:, 0].contiguous())
     # Pixel coordinates of some 100, of which float32 knows 1e-5; measured: 2e-5.
     torch.testing.assert_close(found, clip["motion"][:, 1], rtol=1e-4, atol=2e-4)

@@ -5,16 +5,10 @@ from typing import get_args
 
 import pytest
 import torch
-from torch import Tensor
 from torch.autograd import gradcheck
 
-from mcdenoise.errors import InputError
 from mcdenoise.models import Output
-from mcdenoise.nn.oidn import oidn_exposure
-from mcdenoise.ops._steps.transfer import compress
-from mcdenoise.train.losses import LOSSES, Loss, oidn_loss, rae_loss, stage_loss, stage_weights
-
-BOTH = {"image": 1.0, "initial": 1.0}
+from mcdenoise.train.losses import LOSSES, Loss, rae_loss, stage_loss
 
 
 def values(nested: object) -> list[float]:
@@ -40,12 +34,9 @@ def test_the_loss_is_equation_11() -> None:
     initial, final, reference = (torch.tensor(x, dtype=torch.float64) for x in (r1, r2, y))
     output = Output(final, {"initial": initial, "nothing": torch.full_like(final, torch.nan)})
     expected = spatial(r1) + spatial(r2) + 0.1 * temporal(r1) + 0.1 * temporal(r2)
-    assert stage_loss(output, reference, BOTH).item() == pytest.approx(expected, rel=1e-12)
-    without = stage_loss(output, reference, BOTH, temporal_weight=0)
+    assert stage_loss(output, reference).item() == pytest.approx(expected, rel=1e-12)
+    without = stage_loss(output, reference, temporal_weight=0)
     assert without.item() == pytest.approx(spatial(r1) + spatial(r2), rel=1e-12)
-    weighted = stage_loss(output, reference, {"image": 2, "initial": 0.25}, temporal_weight=0.5)
-    expected = 2 * (spatial(r2) + 0.5 * temporal(r2)) + 0.25 * (spatial(r1) + 0.5 * temporal(r1))
-    assert weighted.item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_loss_on_the_curve_of_a_display() -> None:
@@ -53,13 +44,10 @@ def test_the_loss_on_the_curve_of_a_display() -> None:
     image, reference = (3 * torch.rand(2, 3, 3, 4, 5, dtype=torch.float64) - 0.5 for _ in range(2))
     shown, wanted = ((each.clamp_min(0) + 1e-3) ** (1 / 2.2) for each in (image, reference))
     expected = (shown - wanted).abs().mean()
-    found = stage_loss(Output(image), reference, {"image": 2.0}, temporal_weight=0, loss="l1_display")
-    torch.testing.assert_close(found, 2 * expected)
+    found = stage_loss(Output(image), reference, temporal_weight=0, loss="l1_display")
+    torch.testing.assert_close(found, expected)
     smape, l1 = (
-        [
-            stage_loss(Output(image), reference, {"image": 1.0}, temporal_weight=weight, loss=name)
-            for weight in (0.0, 1.0)
-        ]
+        [stage_loss(Output(image), reference, temporal_weight=weight, loss=name) for weight in (0.0, 1.0)]
         for name in ("smape", "l1_display")
     )
     torch.testing.assert_close(smape[1] - smape[0], l1[1] - l1[0])
@@ -68,7 +56,7 @@ def test_the_loss_on_the_curve_of_a_display() -> None:
 
 def test_the_gradient_on_the_curve_of_a_display_is_finite_in_black() -> None:
     image = torch.zeros(1, 1, 3, 2, 2, requires_grad=True)
-    stage_loss(Output(image), image.detach() + 0.1, {"image": 1.0}, temporal_weight=0, loss="l1_display").backward()
+    stage_loss(Output(image), image.detach() + 0.1, temporal_weight=0, loss="l1_display").backward()
     assert image.grad is not None
     assert torch.isfinite(image.grad).all()
     assert (image.grad < 0).all()
@@ -98,8 +86,8 @@ def test_the_recurrent_autoencoders_loss_is_its_equation() -> None:
             terms.append(counts[t] * (0.8 * spatial + 0.1 * gradient + 0.1 * mean(moved)))
     expected = sum(terms) / 2 / sum(counts)
     assert rae_loss(image, reference).item() == pytest.approx(expected, rel=1e-12)
-    found = stage_loss(Output(image), reference, {"image": 2.0}, loss="rae")
-    assert found.item() == pytest.approx(2 * expected, rel=1e-12)
+    found = stage_loss(Output(image), reference, loss="rae")
+    assert found.item() == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_gradient_of_the_recurrent_autoencoders_loss() -> None:
@@ -111,43 +99,5 @@ def test_the_gradient_of_the_recurrent_autoencoders_loss() -> None:
     assert gradcheck(rae_loss, (image, reference))
 
 
-def test_the_denoisers_loss_is_its_equation() -> None:
-    """One scale: the image is as large as the window, so that its only pixel is a weighted mean over the image."""
-    image, reference = (torch.rand(2, 2, 3, 11, 11, dtype=torch.float64) for _ in range(2))
-    exposure = oidn_exposure(reference[:, 1])[:, None]
-    shown, wanted = compress(image * exposure), compress(reference * exposure)
-    row = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / 4.5)
-    window = row[:, None] * row / row.sum() ** 2
-
-    def mean(x: Tensor) -> Tensor:
-        return (x * window).sum((-2, -1))
-
-    a, b = mean(shown), mean(wanted)
-    var_a, var_b, both = mean(shown**2) - a * a, mean(wanted**2) - b * b, mean(shown * wanted) - a * b
-    alike = (2 * a * b + 1e-4) * (2 * both + 9e-4) / ((a * a + b * b + 1e-4) * (var_a + var_b + 9e-4))
-    error = shown - wanted
-    flicker = (error[:, 1] - error[:, 0]).abs().mean()
-    expected = 0.16 * error.abs().mean() + 0.84 * (1 - alike.mean()) + 0.3 * flicker
-    torch.testing.assert_close(oidn_loss(image, reference, temporal_weight=0.3), expected)
-    with pytest.raises(ValueError, match="reference"):
-        oidn_loss(image, reference[:, :1])
-
-
-def test_the_gradient_of_the_denoisers_loss_on_two_scales() -> None:
-    image, reference = (0.2 + torch.rand(1, 2, 3, 23, 23, dtype=torch.float64) for _ in range(2))
-    image.requires_grad_()
-    assert gradcheck(lambda x: oidn_loss(x, reference), (image,), fast_mode=True)
-    assert float(oidn_loss(reference, reference)) == pytest.approx(0, abs=1e-12)
-
-
 def test_every_loss_has_its_name() -> None:
     assert set(LOSSES) == set(get_args(Loss))
-
-
-def test_default_weights_are_those_of_the_paper() -> None:
-    image = torch.rand(1, 1, 3, 2, 2)
-    assert stage_weights({}, Output(image)) == {"image": 1}
-    assert stage_weights({}, Output(image, {"accumulated": image, "initial": image})) == BOTH
-    assert stage_weights({"accumulated": 2}, Output(image, {"accumulated": image})) == {"accumulated": 2}
-    with pytest.raises(InputError, match=r"losses: .*'initial'"):
-        stage_weights({"initial": 1}, Output(image))

@@ -1,7 +1,8 @@
-"""The cache of decoded sequences: what it holds is what the files hold, and it is never stale and never half made."""
+"""Shots of sequences and takes: what is cached is what the files hold, and it is never stale and never half made."""
 
 import os
 import time
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,15 @@ from refusals import full_disk
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_buffer
+from mcdenoise.data.shards import Shard, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Output, create_model
 from mcdenoise.ops import motion_from_position
-from mcdenoise.train.cache import CachedSequence, features_of, open_cached
+from mcdenoise.train.clips import ClipSampler
+from mcdenoise.train.footage import features_of, shots_of
 from mcdenoise.train.front import Front
+from mcdenoise.train.shots import Shot
 
 FEATURES = ("albedo", "normal", "depth")
 FRONT = Front(((Demodulated, {}), (Accumulated, {})))
@@ -65,14 +69,18 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     return seen
 
 
-def opened(path: Path, folder: Path, **changes: Any) -> CachedSequence:
-    settings: dict[str, Any] = {"front": FRONT, "features": FEATURES, "firsts": [0, 2], **changes}
-    return open_cached(open_sequence(path), folder, **settings)
+def opened(path: Path, folder: Path, front: Front = FRONT, features: Iterable[str] = FEATURES) -> list[Shot]:
+    """Shots of clips of two frames that begin at every second frame."""
+    return shots_of(open_sequence(path), front, frozenset(features), 2, folder, start_every=2)[0]
 
 
-def pixels(cached: CachedSequence) -> torch.Tensor:
+def digest(path: Path, folder: Path) -> str:
+    return shots_of(open_sequence(path), FRONT, frozenset(FEATURES), 2, folder, start_every=2)[1]
+
+
+def pixels(shots: list[Shot]) -> torch.Tensor:
     """All that is in the first shot."""
-    return torch.cat(list(cached.shots[0].read().values()), 1)
+    return torch.cat(list(shots[0].read().values()), 1)
 
 
 def entries(folder: Path) -> list[str]:
@@ -81,9 +89,9 @@ def entries(folder: Path) -> list[str]:
 
 
 def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> None:
-    cached, sequence = opened(noisy, tmp_path / "cache"), open_sequence(noisy)
-    assert [(len(shot), shot.noise_seeds, shot.size) for shot in cached.shots] == [(4, 3, (20, 24)), (2, 3, (20, 24))]
-    for first, shot in zip((0, 2), cached.shots, strict=True):
+    shots, sequence = opened(noisy, tmp_path / "cache"), open_sequence(noisy)
+    assert [(len(shot), shot.noise_seeds, shot.size) for shot in shots] == [(4, 3, (20, 24)), (2, 3, (20, 24))]
+    for first, shot in zip((0, 2), shots, strict=True):
         for noise_seed in range(3):
             clip = shot.read(noise_seed=noise_seed)
             seen: list[Frame] = []
@@ -114,7 +122,7 @@ class Recorder:
 def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:
     sequence = open_sequence(noisy)
     assert features_of(sequence) == {*FEATURES, "position", "view_projection", "motion"}
-    clip = opened(noisy, tmp_path / "cache", features=["motion", "view_projection"]).shots[0].read()
+    clip = opened(noisy, tmp_path / "cache", features=["motion", "view_projection"])[0].read()
     frames = [sequence.frame(number) for number in sequence.numbers]
     assert clip["motion"][0].isinf().all()
     for i in (1, 2, 3):
@@ -126,7 +134,7 @@ def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:
     for number in sequence.numbers:
         write_buffer(inputs, number, "motion", torch.full((1, 2, 20, 24), 1.5))
     # The sequence's own comes first.
-    own = opened(noisy, tmp_path / "cache", features=["motion"]).shots[1].read()
+    own = opened(noisy, tmp_path / "cache", features=["motion"])[1].read()
     assert (own["motion"] == 1.5).all()
 
 
@@ -140,7 +148,7 @@ def test_a_pixel_that_is_no_radiance_is_that_of_its_neighbours_and_a_negative_on
         if name == stem:
             image[10, 10] = value
         write_exr(path, image, ["R", "G", "B"], full_float=True)
-    part = opened(small_sequence, tmp_path / "cache", front=Front(), features=[]).shots[0].read(slice(2, 3))
+    part = opened(small_sequence, tmp_path / "cache", front=Front(), features=[])[0].read(slice(2, 3))
     expected = torch.full((1, 3, 20, 24), 0.5)
     expected[..., 10, 10] = 0 if value < 0 else 0.5
     for name in ("color", "reference"):
@@ -155,17 +163,16 @@ def test_cached_frames_are_not_decoded_again(noisy: Path, tmp_path: Path, reads:
     again = opened(noisy, tmp_path / "cache")
     assert time.process_time() - started < 0.5
     assert not reads
-    assert again.sha256 == first.sha256
-    assert torch.equal(again.shots[1].read(noise_seed=2)["color"], first.shots[1].read(noise_seed=2)["color"])
+    assert torch.equal(again[1].read(noise_seed=2)["color"], first[1].read(noise_seed=2)["color"])
 
 
 def test_features_with_noise_are_those_of_the_noise_seed(noisy_features: Path, tmp_path: Path) -> None:
     names = ("albedo", "normal", "depth", "motion")
-    cached, sequence = opened(noisy_features, tmp_path / "cache", features=names), open_sequence(noisy_features)
+    shots, sequence = opened(noisy_features, tmp_path / "cache", features=names), open_sequence(noisy_features)
     assert sequence.noisy >= {"color", "albedo", "position"}
     assert not sequence.noisy & {"normal", "reference", "view_projection"}
-    whole = cached.shots[0]
-    for shot, first in ((whole, 0), (cached.shots[1], 2), (whole.cut(slice(1, 3)), 1)):
+    whole = shots[0]
+    for shot, first in ((whole, 0), (shots[1], 2), (whole.cut(slice(1, 3)), 1)):
         for noise_seed in range(3):
             clip = shot.read(noise_seed=noise_seed)
             for i in range(len(shot)):
@@ -200,31 +207,31 @@ def test_features_with_noise_are_those_of_the_noise_seed(noisy_features: Path, t
 def test_a_stale_cache_is_made_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]], change: Any) -> None:
     folder = tmp_path / "cache"
     opened(noisy, folder)
-    before, _ = entries(folder), reads.clear()
+    size, _ = len(entries(folder)), reads.clear()
     change(noisy / "inputs")
     fresh = opened(noisy, tmp_path / "elsewhere")
     again = opened(noisy, folder)
     assert len(reads) in (16, 24)  # twice four frames, two or three noise seeds
-    assert again.sha256 == fresh.sha256
-    assert torch.equal(again.shots[0].read()["color"], fresh.shots[0].read()["color"])
-    # A stale entry is removed.
-    assert not set(entries(folder)) & set(before)
+    assert digest(noisy, folder) == digest(noisy, tmp_path / "elsewhere")
+    assert torch.equal(again[0].read()["color"], fresh[0].read()["color"])
+    # It takes the place of what was stale.
+    assert len(entries(folder)) <= size
 
 
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
-        ("color-0-0.npy", "cut"),
-        ("albedo-0.npy", "removed"),
-        ("about.json", "other"),
-        ("normal-0.npy", "bit"),
+        ("from0-0/color.npy", "cut"),
+        ("frames/albedo-0.npy", "removed"),
+        ("frames/about.json", "other"),
+        ("frames/normal-0.npy", "bit"),
     ],
 )
 def test_a_damaged_cache_is_made_again(
     small_sequence: Path, tmp_path: Path, reads: list[tuple[int, int]], name: str, damage: str
 ) -> None:
     whole = pixels(opened(small_sequence, tmp_path / "cache"))
-    path, frames = next((tmp_path / "cache").rglob(name)), len(reads)
+    path, frames = next((tmp_path / "cache").glob(f"*/{name}")), len(reads)
     content = path.read_bytes()
     flipped = bytearray(content)
     flipped[-5] ^= 4
@@ -233,7 +240,7 @@ def test_a_damaged_cache_is_made_again(
     else:
         path.write_bytes({"cut": content[:-20], "other": b"[1, 2, 3]", "bit": flipped}[damage])
     assert torch.equal(pixels(opened(small_sequence, tmp_path / "cache")), whole)
-    assert len(reads) == 2 * frames
+    assert len(reads) == frames * (2 if "frames" in name else 1)
     assert path.read_bytes() == content
 
 
@@ -258,35 +265,85 @@ def test_a_damaged_frame_leaves_nothing_half_made(small_sequence: Path, tmp_path
 
 
 def test_a_full_disk_leaves_nothing_half_made(small_sequence: Path, tmp_path: Path) -> None:
-    with full_disk(8192), pytest.raises(InputError, match=r"cannot be written \(File too large\)"):
+    with full_disk(8192), pytest.raises(InputError, match="cannot be written"):
         opened(small_sequence, tmp_path / "cache")
     assert entries(tmp_path / "cache") == []
-    assert len(opened(small_sequence, tmp_path / "cache").shots[0]) == 4
-
-
-def test_what_a_killed_process_leaves_is_not_taken_for_whole(small_sequence: Path, tmp_path: Path) -> None:
-    whole = pixels(opened(small_sequence, tmp_path / "cache"))
-    (about,) = (tmp_path / "cache").rglob("about.json")
-    about.unlink()
-    about.parent.rename(about.parents[1] / "building")
-    assert torch.equal(pixels(opened(small_sequence, tmp_path / "cache")), whole)
-    assert not any("building" in name for name in entries(tmp_path / "cache"))
+    assert len(opened(small_sequence, tmp_path / "cache")[0]) == 4
 
 
 def test_two_at_once_fill_a_cache_once(small_sequence: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda folder: opened(small_sequence, folder), [tmp_path / "cache"] * 2))
+        found = list(pool.map(lambda folder: pixels(opened(small_sequence, folder)), [tmp_path / "cache"] * 2))
     assert len(reads) == 4
-    assert found[0].sha256 == found[1].sha256
+    assert torch.equal(*found)
 
 
 def test_links_to_nothing_and_names_that_are_no_text_are_no_part_of_a_sequence(noisy: Path, tmp_path: Path) -> None:
     """Broken and circular links beside the frames do not prevent training on the frames."""
-    settings = {"front": FRONT, "features": FEATURES, "firsts": [0]}
-    first = open_cached(open_sequence(noisy), tmp_path / "cache", **settings).sha256
+    first = digest(noisy, tmp_path / "cache")
     for folder in (noisy, noisy / "inputs", noisy / "inputs" / "noise_seed1"):
         for suffix in (".exr", ".json", ".h"):
             (folder / f"dangling{suffix}").symlink_to("nothing")
             (folder / f"loop{suffix}").symlink_to(f"loop{suffix}")
             Path(os.fsdecode(os.fsencode(folder) + b"/M\xfcller" + suffix.encode())).touch()
-    assert open_cached(open_sequence(noisy), tmp_path / "other", **settings).sha256 == first
+    assert digest(noisy, tmp_path / "other") == first
+
+
+# Packed takes: the history of all frames is in those that are kept, and stills give clips, too.
+
+SIZE = (12, 20)
+ALBEDO = frozenset({"albedo"})
+HISTORY = Front(((Demodulated, {}), (Accumulated, {"alpha_min": 0.03})))
+
+
+def take(folder: Path, frames: int = 8, references: int = 3) -> Shard:
+    draws = np.random.default_rng(frames)
+    arrays = {name: draws.random((frames, 3, *SIZE)) for name in ("color", "albedo", "normal")}
+    arrays |= {"motion": np.zeros((frames, 2, *SIZE)), "depth": np.ones((frames, 1, *SIZE))}
+    arrays["reference"] = draws.random((references, 3, *SIZE))
+    arrays["reference_error"] = draws.random((references, 3, *SIZE))
+    path = folder / f"{frames}.take.npz"
+    write_shard(path, {}, arrays)
+    return open_shard(path)
+
+
+def accumulated(shard: Shard, start: int) -> torch.Tensor:
+    """The radiance of the last three frames with a history from this frame on."""
+    step, found = HISTORY.begin(), []
+    arrays = {name: array for name, array in shard.read().items() if len(array) == len(shard)}
+    for t in range(start, len(shard)):
+        images = {n: torch.from_numpy(array[t : t + 1].astype(np.float32)) for n, array in arrays.items()}
+        found.append(step(Frame(**images).validate()[0]).color)
+    return torch.cat(found[-3:])
+
+
+def test_the_frames_that_are_kept_have_the_history_of_all(tmp_path: Path) -> None:
+    shard = take(tmp_path)
+    whole, later = shots_of(shard, HISTORY, ALBEDO, 3, tmp_path / "cache", start_every=2)[0]
+    assert [len(whole), whole.references] == [3, 3]
+    second = 11 - int(later.read()["length"].max()) - 3
+    assert second in (2, 4)
+    for shot, start in ((whole, 0), (later, second)):
+        read = shot.read()
+        assert set(read) == {"color", "current", "length", "albedo", "reference"}
+        torch.testing.assert_close(read["color"], accumulated(shard, start), rtol=1e-3, atol=1e-3)
+        part = shot.cut(slice(1, 3)).read(rows=slice(2, 9))
+        assert all(torch.equal(part[name], read[name][1:, :, 2:9]) for name in read)
+    assert float(whole.read()["length"].max()) == 8
+
+
+def test_without_a_history_all_frames_are_handed(tmp_path: Path) -> None:
+    (shot,) = shots_of(take(tmp_path), Front(), ALBEDO, 3, tmp_path / "cache", start_every=2)[0]
+    read = shot.read()
+    assert {name: len(images) for name, images in read.items()} == {"color": 8, "albedo": 8, "reference": 3}
+    assert "reference" not in shot.cut(slice(2, 4)).read()
+
+
+@pytest.mark.parametrize("front", [Front(), HISTORY], ids=["alone", "accumulated"])
+def test_a_clip_of_a_still_has_as_many_parts_of_it(front: Front, tmp_path: Path) -> None:
+    sources = take(tmp_path, 1, 1), take(tmp_path, 8, 3)
+    shots = [shot for source in sources for shot in shots_of(source, front, ALBEDO, 3, tmp_path / "cache")[0]]
+    clip = ClipSampler([shots[0]], 3, 8).draw([1, 2])
+    assert clip["color"].shape == clip["reference"].shape == (2, 3, 3, 8, 8)
+    assert not torch.equal(clip["color"][:, 0], clip["color"][:, 1])
+    assert ClipSampler(shots, 3, 8).draw(range(6))["color"].shape == (6, 3, 3, 8, 8)
