@@ -113,7 +113,7 @@ def _weighted(function: Any) -> Op:
             inputs["kernel"] = inputs["kernel"].abs().clamp_max(1e4) + 0.1
 
     arguments = {
-        "kernel": Argument(between(-2, 2), 9, _KERNEL),
+        "kernel": Argument(between(-2, 2), 9),
         "guides": Argument(uniform, (1,), _GUIDES),
         "falloffs": Argument(between(0, 3), (1, 1), {"0": constant(0), "to 1e8": between(0, 1e8)}),
         "distance_falloff": Argument(between(0, 0.5), 1),
@@ -125,6 +125,8 @@ def _weighted(function: Any) -> Op:
         ordinary("5x5 taps, normals and depth", (1, 3, 1, 2), kernel=25, guides=(3, 1), **soft),
         stiff("falloffs up to 1e3", guides=between(0, 0.1), falloffs=between(0, 1e3), **soft),
         stiff("f of 1e6, guides 1e-4 apart", guides=between(-1e-4, 1e-4), falloffs=between(0, 1e6), **soft),
+        *(extreme(f"logits {name}", kernel=draw, **soft) for name, draw in _KERNEL.items()),
+        extreme("all weights zero", kernel=constant(0), normalize="none", border="renormalize"),
         extreme("64 channels, f of 1e3", guides=(64,), falloffs=between(0, 1e3), **soft),
         extreme("7x7 on 1x2", (1, 3, 1, 2), kernel=49, normalize="softmax", border="zeros"),
         extreme("no image", (0, 3, 3, 4), **soft),

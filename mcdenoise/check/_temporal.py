@@ -140,11 +140,11 @@ def motion_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str,
 
 
 _PREVIOUS = "previous_view_projection"
-_SCALES = {f"times {scale:g}": _points(scale) for scale in (-1, 0, 1e-30, 1e-4, 1e10, 1e30)}
+_AT_ORIGIN = {_PREVIOUS: _camera(unit=0.0)}
 _MOTION = checked(
     ops.motion_from_position,
     {
-        "position": Argument(_points(), 3, _SCALES | {"some NaN": some(torch.nan, _points())}),
+        "position": Argument(_points(), 3, {"some NaN": some(torch.nan, _points())}),
         # Points near the plane of the camera have very large motion.
         _PREVIOUS: Argument(_camera(), 4, {f"w of {w:g}": _camera(w=w) for w in (1e-15, 1e15)}, lambda *_: (4,)),
     },
@@ -152,6 +152,9 @@ _MOTION = checked(
     # The previous camera was at z = 3.5, and the points are at z = 2 to 5, some of them close to its plane.
     stiff("points behind the camera", (1, 3, 3, 3), **{_PREVIOUS: _camera(3.5)}),
     extreme("scene in millimetres", position=_points(1e3), **{_PREVIOUS: _camera(unit=1e3)}),
+    extreme("behind the camera", position=_points(-1.0)),
+    # At the camera itself motion would be infinite.
+    *(extreme(f"distance {d:g}", position=_points(d), **_AT_ORIGIN) for d in (0.0, 1e-30, 1e-4, 1e10, 1e30)),
     extreme("nothing hit", (1, 3, 2, 3), smooth=(_PREVIOUS,), position=some(torch.inf, _points())),
     extreme("no image", (0, 3, 3, 4)),
     limits={},
