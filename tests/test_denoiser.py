@@ -116,7 +116,7 @@ def test_an_invalid_pixel_is_replaced_and_counted(frames: list[Frame], value: fl
     assert (denoiser.report.replaced_pixels, other.report.replaced_pixels) == (0, 0)
 
 
-@pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position"])
+@pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position", "motion"])
 def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
     denoiser = Denoiser(small_model())
     denoiser(frames[0])

@@ -1,77 +1,56 @@
-"""Builders and rows of the ops that carry images from frame to frame."""
+"""Rows of the ops that carry images from frame to frame, and of the fused steps between them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
 from mcdenoise import ops
-from mcdenoise.check._pixels import seen, sky, wall
-from mcdenoise.check.case import Draw, Inputs, Op, between, constant, dim, radiance, uniform
-from mcdenoise.check.regimes import SMALL, Size, checked, extreme, ordinary, stiff
+from mcdenoise.check._pixels import WALL, noise, proportional, sky, sparks
+from mcdenoise.check.case import Draw, Op, between, constant, dim, numbers, radiance, some, uniform
+from mcdenoise.check.regimes import IMAGE, ORDINARY, SMALL, Argument, checked, extreme, ordinary, stiff
 from mcdenoise.ops import Surface
+from mcdenoise.ops._steps import history
 
 
-def _lagging(
-    g: Generator,
-    size: Size,
-    image: Draw,
-    recent: Draw | None = None,
-    change: float = 2.0,
-    noise: float = 0.5,
-) -> Inputs:
-    history = image(g, *size)
-    latest = change * (1 + noise * uniform(g, *size, low=-1)) * history if recent is None else recent(g, *size)
-    spread = noise * history.mean(1, keepdim=True) * uniform(g, size[0], 1, *size[2:], low=0.5)
-    return {"history": history, "recent": latest, "variance": spread.square()}
+def _compared(light: str, other: str) -> Any:
+    """Another image is drawn as a multiple of the first."""
+
+    def relate(inputs: dict[str, Any], settings: Mapping[str, Any]) -> None:
+        inputs[light] = inputs[light].abs()
+        inputs[other] = inputs[other] * inputs[light]
+        proportional(light)(inputs, settings)
+
+    return relate
 
 
+def _goes_on(drawn: dict[str, Any]) -> None:
+    drawn["history"], drawn["variance"] = torch.zeros_like(drawn["history"]), torch.zeros_like(drawn["variance"])
+
+
+_NO_NOISE = {"recent": constant(1.0045), "variance": constant(0), "threshold": 3.0}
 # Settings for which differences are 1 to 2 times the threshold, so that the result is neither 0 nor 1.
 _LAG = checked(
     ops.history_lag,
-    _lagging,
-    ordinary("no change", (1, 3, 4, 5), between(0.8, 1), change=1.0),
-    ordinary("darker by half", (1, 3, 4, 5), between(0.8, 1), change=0.5, threshold=4.0),
+    {
+        "history": Argument(),
+        "recent": Argument(between(1, 3), limits=numbers(0, 1e-30)),
+        "variance": noise(0.25, 0.5, 1e15),
+    },
+    ordinary("darker by half", (1, 3, 4, 5), between(0.8, 1), recent=between(0.25, 0.75), threshold=4.0),
     # Without noise only the smallest visible difference counts; its square is smaller than the step of finite
     # differences in the variance.
-    stiff("no noise", (1, 1, 1, 1), constant(0.9), ("history", "recent"), change=1.0045, noise=0.0, threshold=3.0),
-    extreme("the light goes out", (1, 3, 5, 6), recent=constant(0)),
-    extreme("the light goes on", (1, 3, 5, 6), constant(0), recent=between(0.5, 1)),
-    extreme("the light goes on at 1e30", (1, 3, 5, 6), constant(0), recent=constant(1e30)),
-    extreme("1e30 and 1e-30", (1, 3, 5, 6), constant(1e30), recent=constant(1e-30)),
-    extreme("noise of 1e15 times the light", (1, 3, 5, 6), constant(1), recent=constant(2), noise=1e15),
-    settings=(
-        {"threshold": 5.5, "kernel_size": 5},
-        {"threshold": 3.0, "kernel_size": 3},
-        {"threshold": 3.5, "kernel_size": 3},
-        {"threshold": 2.0, "kernel_size": 7},
-    ),
+    stiff("no noise", image=constant(0.9), smooth=("history", "recent"), **_NO_NOISE),
+    extreme("the light goes on", (1, 3, 5, 6), uniform, change=_goes_on),
+    extreme("the light goes on at 1e30", (1, 3, 5, 6), constant(1e30), change=_goes_on),
+    settings={"threshold": (5.5, 3.0, 3.5, 2.0), "kernel_size": (5, 3, 3, 7)},
     image=between(0.8, 1),
     fireflies=None,
+    relate=_compared("history", "recent"),
 )
-
-
-def _changing(
-    g: Generator,
-    size: Size,
-    image: Draw,
-    inputs: tuple[str, ...] | None = None,
-    noise: float = 0.05,
-    change: float = 0.4,
-    alter: Callable[[dict[str, Any]], None] | None = None,
-    depth: Draw | None = None,
-) -> Inputs:
-    shape = size[0], 1, *size[2:]
-    previous = image(g, *shape).abs()
-    # Darken all pixels by similar factors: a change beyond the noise, but not to black.
-    current = previous * (change + 0.1 * uniform(g, *shape))
-    spread = (noise * previous * uniform(g, *shape, low=0.5)).square().clamp_max(1e34)
-    images: Inputs = {"current": current, "previous": previous, "weight": uniform(g, *shape, low=0.5)}
-    return seen(images | {"variance": spread, **wall(g, size)}, inputs, alter, depth, g)
 
 
 def _one_sample(drawn: dict[str, Any]) -> None:
@@ -79,6 +58,10 @@ def _one_sample(drawn: dict[str, Any]) -> None:
     drawn["weight"] = torch.zeros_like(drawn["weight"])
     drawn["weight"][..., 1::3, 2::3] = 1
     drawn["weight"][..., :3, :3] = 0
+
+
+def _off(drawn: dict[str, Any]) -> None:
+    drawn["current"][..., :3, :] = 0
 
 
 def _gradient_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:
@@ -95,70 +78,59 @@ def _gradient_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[s
     }
 
 
-def _gradient() -> Op:
-    both, lit = ("current", "previous"), between(0.1, 1.1)
-    noisy = (*both, "variance")
-
-    def off(drawn: dict[str, Any]) -> None:
-        drawn["current"][..., :3, :] = 0
-
-    def still(drawn: dict[str, Any]) -> None:
-        drawn["current"] = drawn["previous"].clone()
-
-    return checked(
-        ops.temporal_gradient,
-        _changing,
-        ordinary("luminance alone", (1, 1, 5, 7), lit, inputs=both, levels=2),
-        ordinary("strata of a pixel, normals", (1, 1, 2, 3), lit, inputs=(*both, "normal"), stratum=1, levels=3),
-        ordinary("one row, depths", (1, 1, 1, 7), lit, inputs=(*noisy, "depth"), sigma_z=3.0, levels=2),
-        ordinary("no filter", (1, 1, 4, 4), lit, inputs=(*noisy, "weight"), levels=0, threshold=1.0),
-        ordinary("brighter", (1, 1, 3, 4), lit, inputs=noisy, change=2.0, levels=2),
-        stiff("nearly all noise", (1, 1, 4, 4), lit, both, inputs=noisy, noise=0.6, levels=2),
-        # Central differences would need a negative weight.
-        extreme("one sample a stratum", (1, 1, 5, 7), lit, both, inputs=(*both, "weight"), alter=_one_sample, levels=1),
-        # Infinity has no finite difference.
-        extreme("sky", (1, 1, 4, 4), lit, noisy, alter=sky, stratum=2, levels=2),
-        # There is no derivative at the limits of the result.
-        extreme("a light goes out", (1, 1, 6, 6), lit, ("depth",), inputs=(*both, "depth"), alter=off, levels=2),
-        extreme("nothing changes", image=lit, alter=still),
-        extreme("noise only", image=lit, inputs=noisy, noise=50.0),
-        extreme("noise of 1e15 times the light", noise=1e15, stratum=2, levels=2),
-        *(extreme(f"depth {z:g}", depth=constant(z), stratum=2, levels=2) for z in (0.0, 1e-30, 1e30, torch.inf)),
-        settings=({"stratum": 2, "levels": 2}, {"stratum": 3, "levels": 1}),
-        sizes=SMALL,
-        image=lit,
-        fireflies=stiff("fireflies", (1, 1, 3, 4), dim, ("weight", "normal", "depth"), stratum=2, levels=2),
-        rounds=_gradient_rounds,
-    )
+_LIT, _BOTH = between(0.1, 1.1), ("current", "previous")
+_NOISY, _LIGHT = (*_BOTH, "variance"), "current previous variance"
+_GRADIENT = checked(
+    ops.temporal_gradient,
+    {
+        # Darken all pixels by similar factors: a change beyond the noise, but not to black.
+        "current": Argument(between(0.4, 0.5), 1, numbers(1)),
+        "previous": Argument(channels=1),
+        "weight": Argument(between(0.5, 1), 1),
+        "variance": noise(0.025, 0.05, 50, 1e15),
+        **WALL,
+    },
+    stiff("nearly all noise", (1, 1, 4, 4), _LIT, _BOTH, variance=between(0.3, 0.6), levels=2),
+    # Central differences would need a negative weight.
+    extreme("one sample a stratum", (1, 1, 5, 7), _LIT, _BOTH, change=_one_sample, levels=1),
+    # Infinity has no finite difference.
+    extreme("sky", (1, 1, 4, 4), _LIT, _NOISY, change=sky, stratum=2, levels=2),
+    # There is no derivative at the limits of the result.
+    extreme("a light goes out", (1, 1, 6, 6), _LIT, ("depth",), only="current previous depth", change=_off, levels=2),
+    settings={
+        "stratum": (2, 3, 1, 2),
+        "levels": (2, 1, 2, 0),
+        "only": (None, f"{_LIGHT} weight", f"{_LIGHT} depth", "current previous normal"),
+        "current": (between(0.4, 0.5), between(2, 2.1)),
+    },
+    sizes=SMALL,
+    image=_LIT,
+    fireflies=stiff("fireflies", (1, 1, 3, 4), dim, ("weight", "normal", "depth"), stratum=2, levels=2),
+    relate=_compared("previous", "current"),
+    rounds=_gradient_rounds,
+)
 
 
-def _camera(batch: int, eye_z: float, unit: float, w: float) -> Tensor:
+def _camera(eye_z: float = 0.0, unit: float = 1.0, w: float = 1.0) -> Draw:
     """Row-vector world-to-clip matrices of a camera that looks along +z; no entry is zero but in special cases."""
-    matrix = torch.tensor(
-        [[1.2, 0.05, 0.02, 0.03], [-0.04, 1.5, 0.01, -0.02], [0.06, -0.03, 1.01, 1.0], [0.1, 0.2, -0.5, -eye_z]],
-        dtype=torch.float64,
-    )
-    matrix[3] *= unit
-    matrix[:, 3] *= w
-    return matrix.repeat(batch, 1, 1)
+
+    def draw(g: Generator, *shape: int) -> Tensor:
+        matrix = torch.tensor(
+            [[1.2, 0.05, 0.02, 0.03], [-0.04, 1.5, 0.01, -0.02], [0.06, -0.03, 1.01, 1.0], [0.1, 0.2, -0.5, -eye_z]],
+            dtype=torch.float64,
+        )
+        matrix[3] *= unit
+        matrix[:, 3] *= w
+        return matrix.repeat(shape[0], 1, 1)
+
+    return draw
 
 
-def _projected(
-    g: Generator,
-    size: Size,
-    image: Draw,
-    scale: float = 1.0,
-    special: float | None = None,
-    eye_z: float = 0.0,
-    unit: float = 1.0,
-    w: float = 1.0,
-) -> Inputs:
-    batch, _, height, width = size
-    depth = uniform(g, batch, 1, height, width, low=2, high=5)
-    position = scale * torch.cat([uniform(g, batch, 2, height, width, low=-1), depth], 1)
-    if special is not None:
-        position[..., 0] = special
-    return {"position": position, "previous_view_projection": _camera(batch, eye_z, unit, w)}
+def _points(scale: float = 1.0) -> Draw:
+    """Points in front of the camera."""
+    sides = torch.tensor([2.0, 2.0, 3.0], dtype=torch.float64).reshape(3, 1, 1)
+    first = torch.tensor([-1.0, -1.0, 2.0], dtype=torch.float64).reshape(3, 1, 1)
+    return lambda g, *shape: scale * (first + sides * uniform(g, *shape))
 
 
 def motion_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor | float]:
@@ -167,19 +139,23 @@ def motion_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str,
     return {"motion": inputs["motion"].abs() + size} if "motion" in inputs else {"result": size}
 
 
+_PREVIOUS = "previous_view_projection"
+_AT_ORIGIN = {_PREVIOUS: _camera(unit=0.0)}
 _MOTION = checked(
     ops.motion_from_position,
-    _projected,
+    {
+        "position": Argument(_points(), 3, {"some NaN": some(torch.nan, _points())}),
+        # Points near the plane of the camera have very large motion.
+        _PREVIOUS: Argument(_camera(), 4, {f"w of {w:g}": _camera(w=w) for w in (1e-15, 1e15)}, lambda *_: (4,)),
+    },
     ordinary("5x7", (1, 3, 5, 7)),
     # The previous camera was at z = 3.5, and the points are at z = 2 to 5, some of them close to its plane.
-    stiff("points behind the camera", (1, 3, 3, 3), eye_z=3.5),
-    extreme("scene in millimetres", smooth=("position", "previous_view_projection"), scale=1e3, unit=1e3),
-    extreme("nothing hit", (1, 3, 2, 3), smooth=("previous_view_projection",), special=torch.inf),
-    *(extreme(f"distance {scale:g}", scale=scale, unit=0.0) for scale in (0.0, 1e-30, 1e-4, 1e10, 1e30)),
-    extreme("some NaN", special=torch.nan),
-    extreme("behind the camera", scale=-1.0),
-    # Points near the plane of the camera have very large motion.
-    *(extreme(f"w of {w:g}", w=w) for w in (1e-15, 1e15)),
+    stiff("points behind the camera", (1, 3, 3, 3), **{_PREVIOUS: _camera(3.5)}),
+    extreme("scene in millimetres", position=_points(1e3), **{_PREVIOUS: _camera(unit=1e3)}),
+    extreme("behind the camera", position=_points(-1.0)),
+    # At the camera itself motion would be infinite.
+    *(extreme(f"distance {d:g}", position=_points(d), **_AT_ORIGIN) for d in (0.0, 1e-30, 1e-4, 1e10, 1e30)),
+    extreme("nothing hit", (1, 3, 2, 3), smooth=(_PREVIOUS,), position=some(torch.inf, _points())),
     extreme("no image", (0, 3, 3, 4)),
     limits={},
     fireflies=None,
@@ -201,155 +177,171 @@ def _resample_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[s
     return {**motion_rounds(inputs, settings), "gradient of motion": torch.zeros_like(motion) + 3 * 1.4 * largest}
 
 
-def _moving(g: Generator, size: Size) -> Tensor:
+def _moving(g: Generator, *shape: int) -> Tensor:
     """Motion by -1, 0 or 1 pixels, plus a fraction away from the kinks at 0 and 1."""
-    whole = torch.randint(-1, 2, (size[0], 2, *size[2:]), generator=g)
-    return whole + uniform(g, *whole.shape, low=0.1, high=0.9)
+    return torch.randint(-1, 2, shape, generator=g) + uniform(g, *shape, low=0.1, high=0.9)
 
 
-def _surface(g: Generator, size: Size) -> dict[str, Tensor]:
-    """Two walls, chosen at random for each pixel, so that about half of the taps clearly show the other wall."""
-    batch, _, height, width = size
-    facing = torch.tensor([[0.0, 0.6, -0.8], [0.8, 0.0, -0.6]], dtype=torch.float64)
-    side = torch.randint(0, 2, (batch, height, width), generator=g)
-    normal = facing[side].movedim(-1, 1) + 0.02 * uniform(g, batch, 3, height, width, low=-1)
-    depth = 5 + 5 * side[:, None] + 0.03 * uniform(g, batch, 1, height, width, low=-1)
-    position = torch.cat([0.03 * uniform(g, batch, 2, height, width, low=-1), depth], 1)
-    label = torch.randint(0, 2, (batch, 1, height, width), generator=g).double()
-    return {"position": position, "normal": normal / normal.norm(dim=1, keepdim=True), "depth": depth, "label": label}
-
-
-def _flat(depth: float, length: float = 1.0) -> Callable[..., None]:
-    """A wall that faces the camera, the same in both frames."""
-
-    def change(drawn: dict[str, Any], *surfaces: dict[str, Tensor]) -> None:
-        for surface in surfaces:
-            surface["depth"][:] = surface["position"][:, 2:] = depth
-            surface["position"][:, :2], surface["normal"][:] = surfaces[0]["position"][:, :2], 0
-            surface["normal"][:, 2] = -length
-
-    return change
-
-
-def _move(value: float, column: int = 1) -> Callable[..., None]:
-    """One column moves by that much."""
-
-    def change(drawn: dict[str, Any], *_: Any) -> None:
-        drawn["motion"][..., column] = value
-
-    return change
-
-
-def _far_out(drawn: dict[str, Any], *_: Any) -> None:
+def _far_out(drawn: dict[str, Any]) -> None:
     drawn["motion"][..., 0], drawn["motion"][..., 1] = 1e4 + 0.5, -1e4 - 0.5
 
 
-def _unknown(drawn: dict[str, Any], *_: Any) -> None:
+def _unknown(drawn: dict[str, Any]) -> None:
     motion = drawn["motion"]
     motion[:, 0, :, 0], motion[:, 1, :, 1], motion[..., 2] = torch.inf, torch.nan, -torch.inf
 
 
-def _resampled(g: Generator, size: Size, image: Draw, change: Callable[..., None] | None = None) -> Inputs:
-    drawn: Inputs = {"previous": image(g, *size), "motion": _moving(g, size)}
-    if change is not None:
-        change(drawn)
-    return drawn
-
-
-_MOTION_ROWS = (
-    # Zero is a whole pixel, where the derivative in the motion jumps.
-    ordinary("still", (1, 3, 2, 3), uniform, ("previous",), change=lambda drawn, *_: drawn["motion"].zero_()),
-    extreme("out of the image", (1, 3, 2, 3), uniform, ("previous", "motion"), change=_far_out),
-    extreme("motion unknown", (1, 1, 2, 4), uniform, ("previous", "motion"), change=_unknown),
-    *(extreme(f"motion {m:g}", change=_move(m)) for m in (1e-30, 1e30, torch.inf, -torch.inf, torch.nan)),
-)
+_ENDS = {f"{value:g}": some(value, _moving) for value in (1e-30, 1e30, torch.inf, -torch.inf, torch.nan)}
 _RESAMPLED = checked(
     ops.resample,
-    _resampled,
-    *_MOTION_ROWS,
+    {"previous": IMAGE, "motion": Argument(_moving, 2, _ENDS)},
+    # Zero is a whole pixel, where the derivative in the motion jumps.
+    ordinary("still", (1, 3, 2, 3), uniform, ("previous",), motion=constant(0)),
+    extreme("out of the image", (1, 3, 2, 3), uniform, ("previous", "motion"), change=_far_out),
+    extreme("motion unknown", (1, 1, 2, 4), uniform, ("previous", "motion"), change=_unknown),
     image=uniform,
     fireflies=stiff("fireflies", (1, 3, 4, 5), radiance),
-    images=("previous",),
     rounds=_resample_rounds,
 )
 
 
+def _walls(g: Generator, *shape: int) -> Tensor:
+    """Position, normal, depth and label of two walls, chosen at random for each pixel: half of the taps differ."""
+    facing = torch.tensor([[0.0, 0.6, -0.8], [0.8, 0.0, -0.6]], dtype=torch.float64)
+    side = torch.randint(0, 2, (shape[0], *shape[2:]), generator=g)
+    rough = uniform(g, shape[0], 7, *shape[2:], low=-1)
+    normal, depth = facing[side].movedim(-1, 1) + 0.02 * rough[:, :3], 5 + 5 * side[:, None] + 0.03 * rough[:, 3:4]
+    label = torch.randint(0, 2, (shape[0], 1, *shape[2:]), generator=g)
+    return torch.cat([0.03 * rough[:, 4:6], depth, normal / normal.norm(dim=1, keepdim=True), depth, label], 1)
+
+
+def _surfaces(inputs: dict[str, Any], settings: Mapping[str, Any]) -> None:
+    for name in ("surface", "previous_surface"):
+        inputs[name] = Surface(*inputs[name].split([3, 3, 1, 1], 1))
+
+
+def _buffers(*names: str) -> Any:
+    """The surfaces have these buffers only."""
+
+    def change(drawn: dict[str, Any]) -> None:
+        for name in ("surface", "previous_surface"):
+            drawn[name] = Surface(**{buffer: getattr(drawn[name], buffer) for buffer in names})
+
+    return change
+
+
+def _at(depth: float) -> Any:
+    """A wall without normals, at that depth in both frames."""
+
+    def change(drawn: dict[str, Any]) -> None:
+        for surface in (drawn["surface"], drawn["previous_surface"]):
+            surface.depth[:], surface.position[:, 2], surface.normal[:] = depth, depth, 0
+
+    return change
+
+
+def _sky_above(drawn: dict[str, Any]) -> None:
+    for surface in (drawn["surface"], drawn["previous_surface"]):
+        surface.position[..., :2, 1:] = surface.depth[..., :2, 1:] = torch.inf
+
+
+def _all_new(drawn: dict[str, Any]) -> None:
+    drawn["surface"].normal.neg_()
+
+
+def _nan_elsewhere(drawn: dict[str, Any]) -> None:
+    drawn["previous_surface"].normal[..., 1] = drawn["previous"][..., 1] = torch.nan
+
+
 def _history(function: Any) -> Op:
     accumulating = function is ops.accumulate
-
-    def build(
-        g: Generator,
-        size: Size,
-        image: Draw,
-        buffers: tuple[str, ...] = (),
-        length: Draw = between(1, 6),
-        change: Callable[..., None] | None = None,
-    ) -> Inputs:
-        inputs: dict[str, Any] = {"previous": image(g, *size), "motion": _moving(g, size)}
-        here, there = _surface(g, size), _surface(g, size)
-        if accumulating:
-            inputs |= {"color": image(g, *size), "previous_length": length(g, size[0], 1, *size[2:])}
-        if change is not None:
-            change(inputs, here, there)
-        if buffers:
-            pair = (Surface(**{name: buffer[name] for name in buffers}) for buffer in (here, there))
-            inputs |= dict(zip(("surface", "previous_surface"), pair, strict=True))
-        return inputs
-
-    def sky_above(drawn: dict[str, Any], *surfaces: dict[str, Tensor]) -> None:
-        for surface in surfaces:
-            surface["position"][..., :2, 1:] = surface["depth"][..., :2, 1:] = torch.inf
-
-    def all_new(drawn: dict[str, Any], here: dict[str, Tensor], _: Any) -> None:
-        here["normal"].neg_()
-
-    def nan_elsewhere(drawn: dict[str, Any], _: Any, there: dict[str, Tensor]) -> None:
-        there["normal"][..., 1] = drawn["previous"][..., 1] = torch.nan
+    length = {"color": IMAGE, "previous_length": Argument(between(1, 6), 1, numbers(1, 255, 65504))}
+    arguments = {"previous": IMAGE, "motion": Argument(_moving, 2)} | (length if accumulating else {})
+    surfaces = {name: Argument(_walls, 8) for name in ("surface", "previous_surface")}
+    alone: dict[str, Any] = {"only": " ".join(arguments)}
 
     def smooth(*names: str) -> tuple[str, ...]:
-        # "bmfr" rounds the length, which then has no derivative.
-        return tuple(name for name in names if accumulating or name in ("previous", "motion"))
-
-    everything = smooth("color", "previous", "previous_length", "motion")
-    but_length, but_previous = smooth("color", "previous", "motion"), smooth("color", "motion")
-    still, *moved = _MOTION_ROWS
-    all_buffers = ("position", "normal", "depth")
-    scene = {"rule": "bmfr", "buffers": all_buffers[:2], "position_limit": 0.5, "normal_limit": 0.25}
-    bmfr = scene | ({"alpha_min": 0.2} if accumulating else {})
-    only: dict[str, Any] = {"buffers": all_buffers}
+        return tuple(name for name in names if name in arguments)
 
     def lasting(draw: Draw, **given: Any) -> dict[str, Any]:
-        return {"length": draw, **({"alpha_min": 0.1} | given if accumulating else {})}
+        """The length of the history, for the op that has one."""
+        return {"previous_length": draw, **given} if accumulating else {}
 
+    everything = smooth("color", "previous", "previous_length", "motion")
+    # "bmfr" rounds the length, which then has no derivative.
+    but_length = smooth("color", "previous", "motion")
+    bmfr = {"rule": "bmfr", "change": _buffers("position", "normal"), "position_limit": 0.5, "normal_limit": 0.25}
     return checked(
         function,
-        build,
-        ordinary("relative, all buffers, batch of 2, RGB", (2, 3, 2, 3), uniform, **only),
-        ordinary(
-            "relative, position and depth", (1, 1, 3, 3), uniform, buffers=("position", "depth"), position_limit=0.03
-        ),
-        ordinary("relative, normal", (1, 1, 3, 3), uniform, buffers=("normal",), normal_limit=0.3),
-        ordinary("relative, all buffers, labels", (1, 3, 3, 3), uniform, buffers=(*all_buffers, "label")),
-        ordinary("bmfr", (1, 3, 3, 3), uniform, but_length, length=between(1, 3.4), **bmfr),
-        ordinary("long history", (1, 1, 3, 3), uniform, **lasting(between(12, 40))),
-        replace(still, smooth=smooth("color", "previous", "previous_length"), given={**still.given, **only}),
-        *(replace(row, smooth=row.smooth and everything) for row in moved),
-        extreme("history length of a byte", (1, 1, 3, 3), uniform, but_length, length=between(250, 255), **bmfr),
-        extreme("sky", (1, 1, 3, 4), uniform, everything, change=sky_above, **only),
-        extreme("new surfaces only", (1, 3, 2, 3), uniform, everything, change=all_new, **only),
+        arguments | surfaces,
+        ordinary("relative, all buffers, labels", (1, 3, 3, 3), uniform),
+        ordinary("relative, position and depth", (1, 1, 3, 3), uniform, change=_buffers("position", "depth")),
+        ordinary("relative, normal", (1, 1, 3, 3), uniform, change=_buffers("normal"), normal_limit=0.3),
+        ordinary("bmfr", (1, 3, 3, 3), uniform, but_length, **bmfr, **lasting(between(1, 3.4), alpha_min=0.2)),
+        # Zero is a whole pixel, where the derivative in the motion jumps.
+        ordinary("still", (1, 3, 2, 3), uniform, smooth("color", "previous", "previous_length"), motion=constant(0)),
+        extreme("out of the image", (1, 3, 2, 3), uniform, everything, change=_far_out, **alone),
+        extreme("motion unknown", (1, 1, 2, 4), uniform, everything, change=_unknown, **alone),
+        # Without surfaces: a tap of no weight may be the only one that shows the surface.
+        *(extreme(f"motion {name}", motion=draw, **alone) for name, draw in _ENDS.items()),
+        extreme("sky", (1, 1, 3, 4), uniform, everything, change=_sky_above),
+        extreme("new surfaces only", (1, 3, 2, 3), uniform, everything, change=_all_new),
         # There are no finite differences of NaN.
-        extreme("NaN on another surface", (1, 3, 2, 3), uniform, but_previous, change=nan_elsewhere, **only),
-        *(extreme(f"history of {n:g} frames", **lasting(constant(n))) for n in (1.0, 255.0, 65504.0)),
-        extreme("history of 1e4 frames, never forgotten", **lasting(constant(1e4), alpha_min=1e-6)),
-        *(extreme(f"depth {z:g}", change=_flat(z), **only) for z in (0.0, 1e-6, 1e10, torch.inf)),
-        *(extreme(f"normals of length {n:g}", change=_flat(5.0, n), **only) for n in (0.0, 1e3)),
-        settings=({}, {"buffers": ("depth",)}, {"buffers": ("depth",)}, {}),
+        extreme("NaN on another surface", (1, 3, 2, 3), uniform, smooth("color", "motion"), change=_nan_elsewhere),
+        *(
+            (
+                ordinary("long history", (1, 1, 3, 3), uniform, previous_length=between(12, 40), **alone),
+                extreme("a byte, bmfr", (1, 1, 3, 3), uniform, previous_length=between(250, 255), **bmfr),
+                extreme("1e4 frames, never forgotten", previous_length=constant(1e4), alpha_min=1e-6, **alone),
+            )
+            if accumulating
+            else ()
+        ),
+        *(extreme(f"depth {z:g}", change=_at(z)) for z in (0.0, 1e-6, 1e10, torch.inf)),
+        settings={"only": (alone["only"], None), "change": (None, _buffers("depth"), None, None)},
         image=uniform,
         smooth=everything,
-        fireflies=stiff("fireflies", (1, 3, 2, 3), radiance, everything, **only),
-        images=("color", "previous") if accumulating else ("previous",),
+        fireflies=stiff("fireflies", (1, 3, 2, 3), radiance, everything),
+        relate=_surfaces,
         rounds=motion_rounds,
     )
 
 
-OPS = (_LAG, _gradient(), _MOTION, _history(ops.reproject), _RESAMPLED, _history(ops.accumulate))
+OPS = (_LAG, _GRADIENT, _MOTION, _history(ops.reproject), _RESAMPLED, _history(ops.accumulate))
+
+
+def _step(function: Any, arguments: dict[str, Argument], smooth: tuple[str, ...] = (), **more: Any) -> Op:
+    """A fused step, for ordinary images; between accumulation and convolutions frames are in float32 at least."""
+    # A light is three pixels wide.
+    regimes: dict[str, Any] = {"sizes": {"5x7": (1, 3, 5, 7), **ORDINARY}, "limits": {}, "fireflies": None}
+    return checked(function, arguments, smooth=smooth, half_precision=False, **regimes, **more)
+
+
+def _bright_corner(g: Generator, *shape: int) -> Tensor:
+    root = uniform(g, *shape, low=0.1, high=3.0)
+    root[..., : shape[-2] // 2 + 1, : shape[-1] // 2 + 1] = 6
+    return root
+
+
+_DRAWN = between(0.1, 3.0)
+_COLOR = Argument(_DRAWN, 3)
+STEPS = (
+    _step(
+        history.incoming,
+        {"color": Argument(sparks(_DRAWN, 400, (0, 0)), 3), "albedo": Argument(between(0.1, 0.9), 3)},
+        least_dtype=torch.float32,
+    ),
+    _step(history.lights, {"root": Argument(_bright_corner, 1)}),
+    _step(
+        history.blend,
+        {
+            "entering": _COLOR,
+            "previous": _COLOR,
+            "previous_length": Argument(between(1.0, 6.0), 1),
+            # Stay away from whole pixels, where the derivative jumps.
+            "motion": Argument(between(0.1, 0.4), 2),
+        },
+        ("entering", "previous", "motion"),
+        rounds=motion_rounds,
+    ),
+)

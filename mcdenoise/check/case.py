@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import torch
@@ -149,32 +149,35 @@ def normal(g: Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=g, dtype=torch.float64)
 
 
-def radiance(g: Generator, *shape: int) -> Tensor:
-    """Radiance over six decades, as in renderings of one sample per pixel: mostly dark, with fireflies up to 1e4."""
-    return 10 ** uniform(g, *shape, low=-2, high=4)
-
-
-def dim(g: Generator, *shape: int) -> Tensor:
-    """Radiance over six decades, with fireflies up to 100, beside which finite differences are accurate."""
-    return radiance(g, *shape) / 100
-
-
 def constant(value: float) -> Draw:
     """The same number everywhere."""
+    return lambda g, *shape: torch.full(shape, value, dtype=torch.float64)
 
-    def draw(g: Generator, *shape: int) -> Tensor:
-        return torch.full(shape, value, dtype=torch.float64)
 
-    return draw
+def numbers(*values: float) -> dict[str, Draw]:
+    """Constants, by what they are."""
+    return {f"{value:g}": constant(value) for value in values}
 
 
 def between(low: float, high: float) -> Draw:
     """Uniformly distributed numbers."""
+    return partial(uniform, low=low, high=high)
 
-    def draw(g: Generator, *shape: int) -> Tensor:
-        return uniform(g, *shape, low=low, high=high)
 
-    return draw
+def powers(low: float, high: float) -> Draw:
+    """Numbers of all magnitudes from ten to the power of ``low`` to ten to the power of ``high``."""
+    return lambda g, *shape: 10 ** uniform(g, *shape, low=low, high=high)
+
+
+def some(value: float, draw: Draw = normal) -> Draw:
+    """The same number in one channel of all pixels, or of one image in its first column."""
+
+    def drawn(g: Generator, *shape: int) -> Tensor:
+        values = draw(g, *shape)
+        values[(slice(None), 2) if shape[1] > 3 else (..., 0)] = value
+        return values
+
+    return drawn
 
 
 def times(factor: float, draw: Draw, offset: float = 0.0) -> Draw:
@@ -195,3 +198,8 @@ def alternating(size: float) -> Draw:
 def softmax(spread: float, total: float = 1.0) -> Draw:
     """Weights of that sum; the larger the spread, the closer to a single one."""
     return lambda g, *shape: total * torch.softmax(spread * normal(g, *shape), 1)
+
+
+# Radiance over six decades, as in renderings of one sample per pixel: mostly dark, with fireflies up to 1e4; and up to
+# 100, beside which finite differences are accurate.
+radiance, dim = powers(-2, 4), powers(-4, 2)

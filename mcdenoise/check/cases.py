@@ -1,7 +1,7 @@
 """The table of ops with their test cases, for gradient checks, stability checks, benchmarks and tests.
 
-To add an op, write its builder and its rows on one of the pages that this one imports; the regimes of
-:mod:`mcdenoise.check.regimes` come by themselves.
+To add an op, write its arguments and its rows on one of the pages that this one imports; the regimes of
+:mod:`mcdenoise.check.regimes` come by themselves. Formulas of :data:`STEPS` are in ``tests/oracles/steps.py``.
 
 Inputs avoid points without a derivative, where finite differences are meaningless: albedo near ``floor``, motion of
 whole pixels, brightness near the limit of fireflies, the history length at which ``alpha`` reaches ``alpha_min``,
@@ -14,6 +14,8 @@ from __future__ import annotations
 from mcdenoise.check import _pixels, _spatial, _temporal
 from mcdenoise.check.case import Case, Inputs, Kind, Op, map_tensors
 
-__all__ = ["OPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
+__all__ = ["OPS", "STEPS", "Case", "Inputs", "Kind", "Op", "map_tensors"]
 
 OPS: tuple[Op, ...] = (*_spatial.OPS, *_pixels.OPS, *_temporal.OPS)
+# Fused steps, which are not public.
+STEPS: tuple[Op, ...] = _temporal.STEPS

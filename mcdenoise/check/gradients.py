@@ -13,9 +13,8 @@ from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
 from mcdenoise.check.case import as_tuple, tensors_in
-from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.cases import OPS, STEPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.own import find_ops, op_of
-from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops import use
 
 Function: TypeAlias = Callable[..., tuple[Tensor, ...]]
@@ -122,56 +121,51 @@ def _mismatch(op: Op, case: Case, order: int) -> str:
                 torch.autograd.gradgradcheck(function, arguments, fast_mode=fast)
     except GradcheckError:
         # The first line of torch's message does not say where the Jacobians differ.
-        message = _located(function, arguments) or (order > 1 and _located_second(function, arguments)) or ""
+        message = _located(function, arguments, order)
         if not message:
             raise
         return message
     return ""
 
 
-def _located(function: Function, arguments: Sequence[Tensor]) -> str:
-    """The first element whose derivative differs from its difference quotient; empty if there is none."""
-    for i, argument in enumerate(arguments):
+def _located(function: Function, arguments: Sequence[Tensor], order: int) -> str:
+    """The first element whose first or second derivative differs from its difference quotient; empty if none does."""
+    inputs, outputs = ([tensor.numel() for tensor in each] for each in (arguments, function(*arguments)))
+    point = torch.cat([argument.detach().flatten() for argument in arguments])
+    upstream = 2 * torch.rand(sum(outputs), dtype=point.dtype) - 1
 
-        def of_one(tensor: Tensor, i: int = i) -> tuple[Tensor, ...]:
-            return function(*arguments[:i], tensor, *arguments[i + 1 :])
+    def flat(numbers: Tensor) -> Tensor:
+        parts = zip(numbers.split(inputs), arguments, strict=True)
+        return torch.cat([each.flatten() for each in function(*(part.view_as(whole) for part, whole in parts))])
 
-        point = argument.detach()
-        jacobians = torch.autograd.functional.jacobian(of_one, point)
-        steps = _STEP * torch.eye(point.numel(), dtype=point.dtype).view(-1, *point.shape)
-        with torch.no_grad():
-            columns = [zip(of_one(point + step), of_one(point - step), strict=True) for step in steps]
-            quotients = zip(
-                *([(up - down).flatten() / (2 * _STEP) for up, down in each] for each in columns), strict=True
+    def slopes(numbers: Tensor) -> Tensor:
+        numbers = numbers if numbers.requires_grad else numbers.detach().requires_grad_()
+        with torch.enable_grad():
+            return torch.autograd.grad((flat(numbers) * upstream).sum(), numbers, create_graph=True)[0]
+
+    for sizes, each, what in ((outputs, flat, ""), (inputs, slopes, "second derivatives: "))[:order]:
+        derivatives = torch.autograd.functional.jacobian(each, point)
+        steps = _STEP * torch.eye(len(point), dtype=point.dtype)
+        pairs = [(each(point + step), each(point - step)) for step in steps]
+        differences = torch.stack([(up - down).detach() / (2 * _STEP) for up, down in pairs], 1)
+        beyond = ~torch.isclose(derivatives, differences, rtol=_RELATIVE, atol=_ABSOLUTE)
+        if beyond.any():
+            row, column = beyond.nonzero()[0].tolist()
+            (output, element), (argument, number) = _place(row, sizes), _place(column, inputs)
+            return (
+                f"{what}Jacobian mismatch for output {output} with respect to input {argument}: element {element} of "
+                f"the output in element {number} of the input has the difference quotient "
+                f"{differences[row, column]:.6g} and the derivative {derivatives[row, column]:.6g}"
             )
-        for j, (jacobian, expected) in enumerate(zip(jacobians, quotients, strict=True)):
-            derivatives, differences = jacobian.reshape(-1, point.numel()), torch.stack(expected, 1)
-            beyond = ~torch.isclose(derivatives, differences, rtol=_RELATIVE, atol=_ABSOLUTE)
-            if beyond.any():
-                row, column = beyond.nonzero()[0].tolist()
-                return (
-                    f"Jacobian mismatch for output {j} with respect to input {i}: element {row} of the output in "
-                    f"element {column} of the input has the difference quotient {differences[row, column]:.6g} and the "
-                    f"derivative {derivatives[row, column]:.6g}"
-                )
     return ""
 
 
-def _located_second(function: Function, arguments: Sequence[Tensor]) -> str:
-    """As :func:`_located`, of the gradients, for random upstream gradients."""
-    upstream = [2 * torch.rand_like(result) - 1 for result in function(*arguments)]
-
-    def gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
-        with torch.enable_grad():
-            leaves = [tensor if tensor.requires_grad else tensor.detach().requires_grad_() for tensor in tensors]
-            pairs = [each for each in zip(function(*leaves), upstream, strict=True) if each[0].requires_grad]
-            results, given = zip(*pairs, strict=True)
-            return torch.autograd.grad(
-                results, leaves, given, create_graph=True, allow_unused=True, materialize_grads=True
-            )
-
-    message = _located(gradients, arguments)
-    return message and f"second derivatives: {message}"
+def _place(index: int, sizes: Sequence[int]) -> tuple[int, int]:
+    """Which of several tensors has a number that is counted through all of them, and where."""
+    part = 0
+    while index >= sizes[part]:
+        index, part = index - sizes[part], part + 1
+    return part, index
 
 
 def _of_differentiable(op: Op, case: Case) -> tuple[Function, tuple[Tensor, ...]]:

@@ -24,9 +24,10 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from mcdenoise.check.case import Case, Inputs, Kind, Op, uniform
+from mcdenoise.check.case import Case, Op, between, constant, map_tensors, tensors_in, times
+from mcdenoise.check.regimes import Argument, checked, extreme, stiff
 from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.methods import parse_method
 from mcdenoise.own import in_one_line, load_own
@@ -34,9 +35,9 @@ from mcdenoise.own import in_one_line, load_own
 ATTRIBUTE, BESIDE = "example_inputs", "inputs"
 # A Jacobian of this many results and inputs takes 128 MiB.
 LARGEST = 4096
-_SEED = 0
 # Shape of the default images: small, because each element is perturbed separately, with one odd and one even side.
 IMAGE = (1, 3, 5, 6)
+_PLAIN = between(0.1, 1.1)
 
 
 def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
@@ -112,7 +113,7 @@ def _examples(name: str, function: Any, module: Any) -> Any:
         return found
     try:
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(_SEED)
+            torch.manual_seed(0)
             return found()
     except Exception as error:
         raise InputError(f"function '{name}': its example inputs fail: {in_one_line(error)}") from error
@@ -121,9 +122,8 @@ def _examples(name: str, function: Any, module: Any) -> Any:
 def _op(name: str, function: Any, examples: Any) -> Op:
     if not callable(function):
         raise InputError(f"function '{name}': expected a function of tensors, found {type(function).__name__}")
-    called = _by_name(name, function)
     if examples is None:
-        return Op(called, _image_cases(name, function), batched=False, own=True)
+        return _on_images(name, function)
     given = examples if isinstance(examples, Mapping) else {"example": examples}
     if not given:
         raise InputError(f"function '{name}': expected example inputs by name, found none")
@@ -131,54 +131,41 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         where = f"function '{name}', {case}"
         _check_tensors(where, tensors)
         _check_results(where, function, tensors)
-    return Op(
-        called,
-        tuple(_case(str(case), function, tensors) for case, tensors in given.items()),
-        batched=False,
-        own=True,
-    )
+    cases = tuple(_case(str(case), function, tensors) for case, tensors in given.items())
+    return Op(_by_name(name, function), cases, batched=False, own=True)
 
 
-def _image_cases(name: str, function: Any) -> tuple[Case, ...]:
-    """Default images, for a function without example inputs."""
-    required = [each for each in _parameters(function) if each.default is each.empty]
-    names = tuple(each.name for each in required)
-    g = Generator().manual_seed(_SEED)
-    images = [uniform(g, *IMAGE, low=0.1, high=1.1) for _ in names]
+def _on_images(name: str, function: Any) -> Op:
+    """A function without example inputs, on default images."""
+    names = [each.name for each in _parameters(function) if each.default is each.empty]
+    # The ends of the range are those of the ops of this package; numbers beyond that of a dtype are clamped to it.
+    regimes = [
+        *(stiff(case, IMAGE, times(value, _PLAIN), ()) for case, value in (("dark", 1e-3), ("bright", 1e3))),
+        stiff("firefly", IMAGE, _PLAIN, (), change=partial(_add_firefly, names)),
+        extreme("black", IMAGE, constant(0)),
+        *(extreme(f"radiance {value:g}", IMAGE, times(value, _PLAIN)) for value in (6e4, 1e30, 1e-30)),
+    ]
+    if len(names) > 1:
+        regimes += [stiff(f"firefly in {x}", IMAGE, _PLAIN, (), change=partial(_add_firefly, [x])) for x in names]
+    # For the other images the step of the finite differences is too large or too small.
+    only: dict[str, Any] = {"sizes": {"ordinary image": IMAGE}, "image": _PLAIN, "limits": {}, "fireflies": None}
+    op = checked(_by_name(name, function), dict.fromkeys(names, Argument()), *regimes, batched=False, own=True, **only)
     try:
-        if not images:
+        if not names:
             raise InputError("it names no argument without a default")
-        _check_results(f"function '{name}'", function, images)
+        _check_results(f"function '{name}'", function, tensors_in(op.cases[0].inputs()))
     except InputError as error:
         reason = str(error).removeprefix(f"function '{name}': ")
         raise InputError(
             f"function '{name}': it has no example inputs, and cannot be tried on images of {IMAGE}: {reason}; give it "
             f"an attribute {ATTRIBUTE}, or its file a function {BESIDE}(), that returns a tuple of tensors"
         ) from error
-    spark = torch.ones(IMAGE, dtype=torch.float64)
-    spark[:, :, 2, 3] = 1e4
-    # The ends of the range are those of the ops of this package; numbers beyond that of a dtype are clamped to it.
-    kinds: dict[str, tuple[Kind, Tensor | float]] = {
-        "ordinary image": ("ordinary", 1.0),
-        "dark": ("stiff", 1e-3),
-        "bright": ("stiff", 1e3),
-        "firefly": ("stiff", spark),
-        "black": ("extreme", 0.0),
-        **{f"radiance {value:g}": ("extreme", value) for value in (6e4, 1e30, 1e-30)},
-    }
-    factors = {case: (kind, dict.fromkeys(names, factor)) for case, (kind, factor) in kinds.items()}
-    if len(names) > 1:
-        factors |= {f"firefly in {name}": ("stiff", {name: spark}) for name in names}
-    return tuple(
-        Case(
-            case,
-            kind,
-            partial(_draw, {each: image * by.get(each, 1.0) for each, image in zip(names, images, strict=True)}),
-            # For the other images the step of the finite differences is too large or too small.
-            names if kind == "ordinary" else (),
-        )
-        for case, (kind, by) in factors.items()
-    )
+    return op
+
+
+def _add_firefly(names: Sequence[str], images: dict[str, Tensor]) -> None:
+    for name in names:
+        images[name][..., 2, 3] *= 1e4
 
 
 def _check_tensors(where: str, tensors: Any) -> None:
@@ -226,20 +213,16 @@ def _by_name(name: str, function: Any) -> Callable[..., Any]:
 
 
 def _case(name: str, function: Any, tensors: Sequence[Tensor]) -> Case:
-    names = _arguments(function, len(tensors))
-    chosen = tuple(each for each, tensor in zip(names, tensors, strict=True) if tensor.requires_grad)
-    drawn = {each: tensor.detach().double() for each, tensor in zip(names, tensors, strict=True)}
-    return Case(name, "ordinary", partial(_draw, drawn), chosen or names)
+    parameters = [each.name for each in _parameters(function)]
+    # Numbered names for arguments without a name.
+    names = (parameters + [f"input {i + 1}" for i in range(len(parameters), len(tensors))])[: len(tensors)]
+    given = dict(zip(names, tensors, strict=True))
+    chosen = tuple(each for each in given if given[each].requires_grad)
+    return Case(name, "ordinary", lambda g: map_tensors(_copy, {**given}), chosen or tuple(names))
 
 
-def _draw(drawn: Mapping[str, Tensor], g: Generator) -> Inputs:
-    return {name: tensor.clone() for name, tensor in drawn.items()}
-
-
-def _arguments(function: Any, count: int) -> tuple[str, ...]:
-    """Names of the first arguments; numbered names for arguments without a name."""
-    names = [each.name for each in _parameters(function)]
-    return tuple(names[i] if i < len(names) else f"input {i + 1}" for i in range(count))
+def _copy(tensor: Tensor) -> Tensor:
+    return tensor.detach().double().clone()
 
 
 def _parameters(function: Any) -> list[inspect.Parameter]:

@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check.case import uniform
-from mcdenoise.check.cases import OPS, Case, Op
+from mcdenoise.check.cases import OPS, STEPS, Case, Op
 from mcdenoise.check.gradients import check_case, select
-from mcdenoise.check.step_cases import STEPS
 
 
 class _Wrong(torch.autograd.Function):

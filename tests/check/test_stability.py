@@ -85,7 +85,7 @@ def test_a_softmax_that_overflows_fails() -> None:
 
     cases = tuple(case for case in op.cases if case.settings.get("normalize") != "none")
     found = failures(like("cross_bilateral_weights", naive, cases=cases))
-    assert {"logits to +-1e4", "logits of -1e4", "logits 1e4 and 1 apart"} <= found["forward"] & found["weights"]
+    assert {"logits to +-1e4", "logits of -1e4", "logits of 1e4"} <= found["forward"] & found["weights"]
     assert not found["forward"] & {case.name for case in cases if case.kind == "ordinary"}
 
 
@@ -95,7 +95,7 @@ def test_a_nan_gradient_fails() -> None:
         return torch.where(albedo.amax(1, keepdim=True) >= 1e-4, color / albedo.clamp_min(floor), color + 0 * divided)
 
     found = failures(like("demodulate", clamped))
-    assert {"albedo 0"} <= found["gradient"]
+    assert "albedo 0" in found["gradient"]
 
 
 @pytest.mark.parametrize("scale", [1 + 1e-5, 1 - 1e-5])
@@ -127,12 +127,15 @@ def test_backends_are_checked_and_unavailable_ones_are_reported(monkeypatch: pyt
 
 
 def test_a_model_is_stable(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The command has all cases; ordinary light, none, much, a firefly, and one pixel suffice here.
-    few = {"ordinary", "radiance 0", "radiance 1e+30", "one firefly of 1e6", "albedo 0", "1x1"}
-    monkeypatch.setattr(_models, "CASES", [case for case in _models.CASES if case.name in few])
+    # The command has all frames; ordinary light, none, much, uneven light, and one pixel suffice here.
+    every = _models.frames()
+    few = {name: every[name] for name in ("ordinary", "color 0", "color 1e+30", "uneven radiance", "albedo 0", "1x1")}
+    monkeypatch.setattr(_models, "frames", lambda: few)
     checks = list(check_model("wild_small", (torch.float32,)))
     assert not [f"{check.what}, {check.case}: {check.message}" for check in checks if not check.passed]
-    assert {check.what for check in checks} == {"finite", "gradient", "forward", "exposure"}
+    assert {(check.what, check.case) for check in checks} == {
+        (what, x) for what in ("forward", "gradient") for x in few
+    }
 
 
 def test_derivatives_of_a_denoiser_in_black_pixels(tmp_path: Path) -> None:
@@ -179,8 +182,7 @@ def test_long_runs() -> None:
     still = runs["still", "bfloat16"]
     # Errors in half precision are not zero, and close enough to the bound to make it meaningful.
     assert 0.01 * still.allowed < still.error < still.allowed < 0.05
-    assert runs["light off, without anti-lag", "float32"].error == 44
-    assert runs["light off, with anti-lag", "float32"].error == 1
+    assert {name for name, _ in runs} == {"still", "moving", "average"}
 
 
 def test_the_command(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ MUTANTS = tuple(
     for each in (
         # Borders, windows and half pixels.
         ("kernel_conv", "ops/kernel_conv.py", "torch.where(mask, kernel, 0).sum(1", "kernel.sum(1"),
-        ("kernel_conv", "ops/_window.py", "tap // kernel_size - radius, tap", "radius - tap // kernel_size, tap"),
+        ("kernel_splat", "ops/_window.py", "tap // kernel_size - radius, tap", "radius - tap // kernel_size, tap"),
         ("kernel_splat", "ops/_window.py", "[before, zeros], dim", "[zeros, before], dim"),
         ("upsample", "ops/fusion.py", 'mode="nearest"', 'mode="bilinear"'),
         (_LAG, "ops/lag.py", "(radius, 0), count_include_pad=False", "(radius, 0), count_include_pad=True"),

@@ -9,9 +9,8 @@ from reference_cases import by
 from torch import Tensor
 
 from mcdenoise.check import gradients
-from mcdenoise.check.case import Case, Op
+from mcdenoise.check.cases import STEPS, Case, Op
 from mcdenoise.check.stability._ops import check_op, select
-from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops._op import backends_of
 from mcdenoise.ops._steps import history
 

@@ -25,7 +25,7 @@ class Check:
         backend: backend of an op; ``""`` if it has only one.
         what: the property that was checked, such as ``"forward"`` or ``"exposure"``.
         error: the error closest to its bound, in units of the dtype's epsilon times the condition number; of a long run
-            relative to the largest value, or the number of frames that a ghost lasts.
+            relative to the largest value.
         allowed: its bound by error analysis, in the same units.
         condition: maximum condition number of the case: the factor by which it magnifies relative input changes.
         passed: whether the property holds.
@@ -51,16 +51,20 @@ class Check:
 
 
 def bounded(
-    subject: str, case: str, dtype: torch.dtype, what: str, error: float, allowed: float, condition: float = 0.0
+    subject: str,
+    case: str,
+    dtype: torch.dtype,
+    what: str,
+    error: float = 0.0,
+    allowed: float = 0.0,
+    condition: float = 0.0,
+    message: str = "",
+    backend: str = "",
 ) -> Check:
-    """A check that an error is at most what is allowed; NaN is not."""
-    message = "" if error <= allowed else f"error {error:.3g}, expected at most {allowed:.3g}"
-    return Check(subject, case, name_of(dtype), "", what, error, allowed, condition, not message, message)
-
-
-def held(subject: str, case: str, dtype: torch.dtype, what: str, message: str) -> Check:
-    """A check of a property, which holds if there is no message."""
-    return Check(subject, case, name_of(dtype), "", what, 0, 0, 0, not message, message)
+    """A check that there is no message, and that an error is at most what is allowed; NaN is not."""
+    if not message and not error <= allowed:
+        message = f"error {error:.3g}, expected at most {allowed:.3g}"
+    return Check(subject, case, name_of(dtype), backend, what, error, allowed, condition, not message, message)
 
 
 def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:

@@ -32,7 +32,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -40,12 +39,11 @@ from torch import Tensor
 
 from mcdenoise.check import gradients
 from mcdenoise.check.case import Case, Op, map_tensors, tensors_in
-from mcdenoise.check.cases import OPS
+from mcdenoise.check.cases import OPS, STEPS
 from mcdenoise.check.own import find_ops, op_of
-from mcdenoise.check.stability._check import DTYPES, Check, name_of
+from mcdenoise.check.stability._check import DTYPES, Check, bounded
 from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.stability._trial import Function, Trial, backends
-from mcdenoise.check.step_cases import STEPS
 from mcdenoise.ops._window import accumulator_dtype
 from mcdenoise.own import in_one_line
 
@@ -133,15 +131,10 @@ def check_case(op: Op, case: Case, dtype: torch.dtype) -> Iterator[Check]:
 
 
 def _checks(trial: Trial, known: dict[str, list[_Exact]]) -> Iterator[Check]:
-    op = trial.op
     try:
         results = trial.run(trial.leaves)
     except Exception as error:
-        # A backend that cannot run on this machine raises a ValueError; a user's function may fail in one dtype only.
-        if not (op.own or isinstance(error, ValueError)):
-            raise
-        message = in_one_line(error)
-        yield replace(_found(trial, "runs", 0, 0, 0, message), passed=bool(trial.backend) and "can run here" in message)
+        yield replace(trial.found("runs", message=in_one_line(error)), passed=_cannot_run(trial, error))
         return
     exact = known["forward"] = known.get("forward") or _exact_results(trial, results)
     yield _compare(trial, "forward", results, exact)
@@ -149,18 +142,20 @@ def _checks(trial: Trial, known: dict[str, list[_Exact]]) -> Iterator[Check]:
     try:
         gradients = trial.gradients(leaves)
     except Exception as error:
-        if op.own:
-            yield _found(trial, "gradient", 0, 0, 0, in_one_line(error))
-        # So does a backend without derivatives.
-        elif not isinstance(error, ValueError) or not trial.backend or "can run here" not in str(error):
-            raise
+        if not _cannot_run(trial, error):
+            yield trial.found("gradient", message=in_one_line(error))
     else:
         true = known["gradient"] = known.get("gradient") or _exact_gradients(trial, leaves, exact)
         yield _compare(trial, "gradient", gradients, true)
-    if op.weights(trial.case.settings):
+    if trial.op.weights(trial.case.settings):
         yield _check_weights(trial, results[0])
-    if op.images and trial.case.kind != "extreme":
+    if trial.op.images and trial.case.kind != "extreme":
         yield _check_exposure(trial, results[0])
+
+
+def _cannot_run(trial: Trial, error: Exception) -> bool:
+    """Whether that is the error of a backend that is not on this machine, or has no derivatives."""
+    return bool(trial.backend) and isinstance(error, ValueError) and "can run here" in str(error)
 
 
 def _exact_results(trial: Trial, results: list[Tensor]) -> list[_Exact]:
@@ -219,22 +214,19 @@ def _conditions(
     base = function(leaves)
     changing = function if at_once else _one_by_one(function, leaves)
     # Infinity is not perturbed, and zeros of non-negative inputs are not perturbed below zero.
-    up = [torch.where(size.isfinite(), step * size, 0).flatten() for size in magnitudes]
-    down = [move * ((leaf != 0) | (leaf < 0).any()).flatten() for move, leaf in zip(up, leaves, strict=True)]
+    up = torch.cat([torch.where(size.isfinite(), step * size, 0).flatten() for size in magnitudes])
+    below = torch.cat([((leaf != 0) | (leaf < 0).any()).flatten() for leaf in leaves])
+    flat, sizes = torch.cat([leaf.flatten() for leaf in leaves]), [leaf.numel() for leaf in leaves]
     totals = [torch.zeros_like(result) for result in base]
     fans = [torch.zeros_like(result) for result in base]
-    starts = list(accumulate((leaf.numel() for leaf in leaves), initial=0))
-    for start in range(0, starts[-1], _AT_ONCE):
-        count = min(_AT_ONCE, starts[-1] - start)
-        copies = [leaf.repeat(2 * count, *(1,) * (leaf.ndim - 1)) for leaf in leaves]
-        for i, (first, end) in enumerate(pairwise(starts)):
-            # The elements of this leaf in this batch; each has two copies of the inputs.
-            numbers = torch.arange(max(start, first), max(start, first, min(start + count, end)))
-            if not len(numbers):
-                continue
-            copy, rows, columns = copies[i].view(2 * count, -1), 2 * (numbers - start), numbers - first
-            copy[rows, columns] += up[i][columns]
-            copy[rows + 1, columns] -= down[i][columns]
+    for numbers in torch.arange(len(flat)).split(_AT_ONCE) if len(flat) else ():
+        rows, count = torch.arange(len(numbers)), len(numbers)
+        # Two copies of all inputs for each number of them.
+        pairs = flat.repeat(count, 2, 1)
+        pairs[rows, 0, numbers] += up[numbers]
+        pairs[rows, 1, numbers] -= (up * below)[numbers]
+        parts = pairs.flatten(0, 1).split(sizes, 1)
+        copies = [part.reshape(-1, *leaf.shape[1:]) for part, leaf in zip(parts, leaves, strict=True)]
         for result, total, fan, changed in zip(base, totals, fans, changing(copies), strict=True):
             both = changed.reshape(count, 2, *result.shape)
             change = (both - result).abs()
@@ -271,7 +263,7 @@ def _compare(trial: Trial, what: str, results: list[Tensor], exact: list[_Exact]
     must_be_finite = trial.must_be_finite or (trial.op.finite and what != "gradient")
     if _all_finite(trial.leaves) and (undefined or (must_be_finite and not _all_finite(values))):
         kind = "NaN" if undefined else "infinity"
-        return _found(trial, what, 0, 0, 0, f"{kind} in float64, where all inputs are finite")
+        return trial.found(what, message=f"{kind} in float64, where all inputs are finite")
     worst, highest, condition, message = (0.0, 0.0), 0.0, 0.0, ""
     for result, truth in zip(results, exact, strict=True):
         largest = torch.finfo(result.dtype).max
@@ -302,7 +294,7 @@ def _compare(trial: Trial, what: str, results: list[Tensor], exact: list[_Exact]
             worst = (error.reshape(-1)[i].item() / unit, truth.bound.reshape(-1)[i].item() / unit) if known else (0, 0)
         if fraction.max() > 1 and not message:
             message = f"found {found.reshape(-1)[i].item():.9g}, expected {truth.value.reshape(-1)[i].item():.9g}"
-    return _found(trial, what, *worst, condition, message)
+    return trial.found(what, *worst, condition, message)
 
 
 def _all_finite(tensors: Sequence[Tensor]) -> bool:
@@ -312,7 +304,7 @@ def _all_finite(tensors: Sequence[Tensor]) -> bool:
 def _check_derivative(op: Op, case: Case) -> Check:
     """Check first derivatives in float64, which are the reference for those in other dtypes."""
     result = gradients.check_case(op, case, order=1)
-    return Check(op.name, case.name, "float64", "", "derivative", 0, 0, 0, result.passed, result.message)
+    return bounded(op.name, case.name, torch.float64, "derivative", message=result.message)
 
 
 def _check_weights(trial: Trial, weights: Tensor) -> Check:
@@ -322,24 +314,23 @@ def _check_weights(trial: Trial, weights: Tensor) -> Check:
     allowed += weights.shape[1] * torch.finfo(weights.dtype).tiny
     error = (total - 1).abs().max().item() if total.numel() else 0.0
     message = "" if bool((weights >= 0).all()) else "a weight is negative or NaN"
-    if not error <= allowed and not message:
-        message = f"weights sum to 1 +- {error:.3g}, expected +- {allowed:.3g}"
     eps = torch.finfo(weights.dtype).eps
-    return _found(trial, "weights", error / eps, allowed / eps, 1.0, message)
+    return trial.found("weights", error / eps, allowed / eps, 1.0, message)
 
 
 def _check_exposure(trial: Trial, result: Tensor) -> Check:
     """``f(s x) = s f(x)``, exactly, as long as no value leaves the range of the dtype."""
     message = ""
     for exposure in _EXPOSURES:
-        images = {name: _tensor(trial.inputs[name]) * exposure for name in trial.images}
+        given: dict[str, Any] = trial.inputs
+        images = {name: exposure * given[name] for name in trial.images}
         if not all(bool(_normal_range(image).all()) for image in images.values()):
             continue
         scaled = replace(trial, inputs={**trial.inputs, **images})
         found, expected = scaled.run(scaled.leaves)[0], result * exposure
         if not torch.equal(found, expected) and bool(_normal_range(expected).all()):
             message = f"the result of the image times {exposure:g} is not {exposure:g} times that of the image"
-    return _found(trial, "exposure", 0, 0, 1.0, message)
+    return trial.found("exposure", condition=1.0, message=message)
 
 
 def _normal_range(tensor: Tensor) -> Tensor:
@@ -349,19 +340,9 @@ def _normal_range(tensor: Tensor) -> Tensor:
     return (size == 0) | ((size >= limits.tiny / limits.eps) & (size <= limits.max / 64))
 
 
-def _found(trial: Trial, what: str, error: float, allowed: float, condition: float, message: str) -> Check:
-    names = (trial.op.name, trial.case.name, name_of(trial.dtype), trial.backend or "")
-    return Check(*names, what, error, allowed, condition, not message, message)
-
-
 def _upstream(result: Tensor) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     return torch.randn(result.shape, generator=generator, dtype=torch.float64).to(result.dtype)
-
-
-def _tensor(value: object) -> Tensor:
-    assert isinstance(value, Tensor)
-    return value
 
 
 def _unit(dtype: torch.dtype) -> float:

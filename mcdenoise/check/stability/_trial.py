@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check.case import Case, Inputs, Op, as_tuple, map_tensors, tensors_in
+from mcdenoise.check.stability._check import Check, bounded
 from mcdenoise.ops import Surface, use
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._op import backends_of
@@ -52,6 +53,13 @@ class Trial:
     def numbers(self) -> Inputs:
         """The arguments that are rounded."""
         return {name: value for name, value in self.inputs.items() if not isinstance(value, Surface)}
+
+    def found(
+        self, what: str, error: float = 0.0, allowed: float = 0.0, condition: float = 0.0, message: str = ""
+    ) -> Check:
+        """A check of the trial, see :func:`bounded`."""
+        about = self.op.name, self.case.name, self.dtype
+        return bounded(*about, what, error, allowed, condition, message, self.backend or "")
 
     def run(self, leaves: Sequence[Tensor]) -> list[Tensor]:
         """Run the op with other tensors in place of :attr:`leaves`, possibly with several copies of the batch."""
