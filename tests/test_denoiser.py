@@ -120,7 +120,8 @@ def test_an_invalid_pixel_is_replaced_and_counted(frames: list[Frame], value: fl
 def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
     denoiser = Denoiser(small_model())
     denoiser(frames[0])
-    broken = getattr(frames[1], name).clone()
+    given = getattr(frames[1], name)
+    broken = torch.zeros_like(frames[1].color[:, :2]) if given is None else given.clone()
     broken[0, 0, 2, 3] = float("nan")
     message = refused(lambda: denoiser(frames[1].replace(**{name: broken})))
     assert f"buffer '{name}'" in message

@@ -320,7 +320,7 @@ def even(height: int, width: int, model: Any) -> Frame:
 @pytest.mark.parametrize("name", sorted(set(KINDS) - {"oidn"}))
 @torch.no_grad()
 def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
-    """Up to its borders: it varies by little more than far from them, and has the level that it has there."""
+    """Up to its borders: it varies by little more than far from them, or than it is wrong there anyway."""
     plain = {"restore": False} if "restore" in inspect.signature(find_model(name).construct).parameters else {}
     model = create_model(name, pretrained=name in [*pretrained_models(), *compared_models()], **plain).eval()
 
@@ -330,7 +330,7 @@ def test_a_constant_image_stays_constant_at_every_size(name: str) -> None:
 
     far = ratios(192, 192)[..., 64:128, 64:128]
     level = far.mean((2, 3), keepdim=True)
-    bound = 0.025 + 2 * float((far - level).abs().max())
+    bound = 0.025 + max(2 * float((far - level).abs().max()), float((far - 1).abs().max()))
     for size in ((1, 1), (3, 5), (17, 31), (33, 1), (96, 128)):
         assert float((ratios(*size) / level - 1).abs().max()) < bound, size
 
@@ -703,6 +703,8 @@ def test_compared_weights_have_equal_training_settings() -> None:
     about = {name: describe_weights(SHIPPED / "compared" / f"{name}.safetensors") for name in compared_models()}
     assert not set(about) & set(pretrained_models())
     own = {"model", "loss", "temporal_weight"}
+    # The page of the zoo says that this one alone is of the present recipe.
+    assert json.loads(about.pop("cascaded")["config"])["crop"] == 128
     configs = [json.loads(each["config"]) for each in about.values()]
     assert all(
         {k: v for k, v in each.items() if k not in own} == {k: v for k, v in configs[0].items() if k not in own}
