@@ -11,7 +11,6 @@ the frames after the first, and the peak memory of the process. 7680x4320 takes 
 
 import argparse
 import json
-import sys
 import tempfile
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from mcdenoise.benchmark.memory import output_and_peak
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.models import DEFAULT
 
 
@@ -82,8 +81,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

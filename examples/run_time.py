@@ -14,7 +14,6 @@ import argparse
 import json
 import re
 import statistics
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ import torch
 from mcdenoise import Frame, create_model
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.data.files import write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Accumulated, Skipping
@@ -106,8 +105,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -12,7 +12,6 @@ with and without skipping. The last column is the change of SMAPE.
 
 import argparse
 import statistics
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError
 from mcdenoise.data import Sequence, open_sequence
+from mcdenoise.errors import run_script
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import DEFAULT
 from mcdenoise.models._report import Stage, summarize
@@ -150,8 +150,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

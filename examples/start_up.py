@@ -25,7 +25,7 @@ from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 
 PEER = """
 import sys
@@ -131,8 +131,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

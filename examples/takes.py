@@ -12,7 +12,6 @@ Open Image Denoise has its better setting of each take: features as noisy, or de
 import argparse
 import json
 import math
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from mcdenoise.data.files import write_json
 from mcdenoise.data.shards import find_shards, open_shard
-from mcdenoise.errors import InputError
+from mcdenoise.errors import run_script
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
@@ -114,8 +113,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -13,7 +13,6 @@ import argparse
 import itertools
 import json
 import statistics
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
 from mcdenoise.data.files import write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, create_model
 from mcdenoise.models._precision import Precision
@@ -130,8 +129,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

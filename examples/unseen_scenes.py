@@ -20,7 +20,6 @@ The file of --json has every setting separately. For a sweep of your own, use fo
 
 import argparse
 import json
-import sys
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
@@ -40,7 +39,7 @@ from mcdenoise.benchmark.tables import remarks
 from mcdenoise.data import open_sequence
 from mcdenoise.data.files import write_text
 from mcdenoise.data.sequences import with_unique_names
-from mcdenoise.errors import InputError
+from mcdenoise.errors import run_script
 from mcdenoise.evaluate import USUAL, noise_floor
 from mcdenoise.models import DEFAULT
 
@@ -127,8 +126,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -13,7 +13,6 @@ import argparse
 import json
 import re
 import statistics
-import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,7 @@ from typing import NamedTuple
 from takes import OIDN, Rows, mean, ratios
 
 from mcdenoise.data.files import write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.reading import read_text
 
 METHODS = {
@@ -160,8 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -9,10 +9,11 @@ from __future__ import annotations
 import multiprocessing
 import platform
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from typing import Any, TypeAlias
 
@@ -71,6 +72,35 @@ def run_tasks(engine: Engine, tasks: deque[Task], on_wait: Callable[[], object] 
                     outcome = None, describe_error(error)
                 task.on_end(*outcome)
             on_wait()
+
+
+def run_each(
+    engine: Engine,
+    function: Callable[..., Any],
+    calls: Iterable[tuple[Any, ...]],
+    on_answer: Callable[[Any, Any], object],
+) -> list[tuple[Any, str]]:
+    """Run a function with each of several arguments; closes the engine at the end.
+
+    Args:
+        engine: runs the calls.
+        function: of a module that workers can import.
+        calls: the arguments of each call, which can be pickled.
+        on_answer: called in this process with the arguments of a call and its answer.
+
+    Returns:
+        The arguments of each call that failed, and why.
+    """
+    failed: list[tuple[Any, str]] = []
+
+    def end(call: tuple[Any, ...], answer: Any, reason: str | None) -> None:
+        if reason is None:
+            on_answer(call, answer)
+        else:
+            failed.append((call, reason))
+
+    run_tasks(engine, deque(Task(function, call, partial(end, call)) for call in calls))
+    return failed
 
 
 def _call(driver: str, function: Callable[..., Any], *arguments: Any) -> Outcome:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 
 # A channel name may have 255 bytes, and a path 4096.
@@ -26,6 +26,15 @@ class InputError(ValueError):
 
 class MissingBufferError(InputError):
     """A frame lacks a buffer that a method needs."""
+
+
+def run_script(main: Callable[[], object]) -> None:
+    """Run a script: bad input is one line on standard error, and exit status 2."""
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -9,7 +9,6 @@ MB. A part that exists is not written again.
 
 import argparse
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.shards import Shard
-from mcdenoise.errors import InputError
+from mcdenoise.errors import run_script
 from mcdenoise.models import create_model
 from mcdenoise.train.data import describe_takes, open_takes
 from mcdenoise.train.footage import shots_of
@@ -93,8 +92,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

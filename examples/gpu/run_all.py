@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from mcdenoise.data.files import write_json
-from mcdenoise.errors import InputError
+from mcdenoise.errors import run_script
 
 # Seconds of each part once Python and torch have started; rows that have begun then still end.
 PARTS = {"about": 15, "models": 100, "peer": 12, "mitsuba_loop": 20, "training": 22, "ops": 70}
@@ -57,8 +57,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

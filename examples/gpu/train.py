@@ -16,7 +16,6 @@ import copy
 import json
 import math
 import random
-import sys
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from torch import Tensor, nn
 from mcdenoise.cli.train import options_of
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path, write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import psnr_srgb, smape_linear
 from mcdenoise.models import save_weights
@@ -341,8 +340,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

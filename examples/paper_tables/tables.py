@@ -24,7 +24,6 @@ All networks of a table have the same training settings, and their input is accu
 """
 
 import argparse
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -41,7 +40,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS, smape_linear
 from mcdenoise.models import Output, create_model, describe_weights
@@ -98,12 +97,8 @@ def chance(gains: Sequence[float]) -> float:
 
     The exact paired test of Fisher; with six scenes it is at least 2 / 64.
     """
-    signed = [abs(sum(g if sign else -g for g, sign in zip(gains, signs, strict=True))) for signs in _signs(len(gains))]
+    signed = [abs(sum(each)) for each in product(*((gain, -gain) for gain in gains))]
     return sum(each >= abs(sum(gains)) - 1e-12 for each in signed) / len(signed)
-
-
-def _signs(count: int) -> Iterator[tuple[bool, ...]]:
-    return product((False, True), repeat=count)
 
 
 class Measured:
@@ -369,8 +364,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -19,7 +19,7 @@ from typing import get_args
 from folds import RECIPES, Split, fold_folder, scenes_of, training_scenes
 
 from mcdenoise.cli.train import options_of
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.train import Progress, Recipe, train
 
 _BUDGET = ("steps", "batch", "frames", "crop", "learning_rate")
@@ -77,8 +77,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    run_script(main)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +14,7 @@ from mcdenoise.cli._options import Flag, Out, parse_size
 from mcdenoise.cli._output import print_rows, progress_bar, say, warn
 from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.engines import RayEngine, Task, parse_workers, run_tasks
+from mcdenoise.engines import RayEngine, parse_workers, run_each
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, default_folder, open_assets
 from mcdenoise.scenes.generation import SequencePlan
@@ -153,19 +151,15 @@ def _on_ray(plan: TakePlan | SequencePlan, seeds: list[int], address: str, out: 
         variant = "" if plan.cycles else choose_variant(plan.rendering["variant"])
         plan = replace(plan, threads=threads, rendering={**plan.rendering, "variant": variant or None})
     engine = RayEngine(address, cpus=threads, gpus=float(variant.startswith("cuda")))
-    failed: list[dict[str, str]] = []
     with progress_bar() as progress:
         scenes = progress.add_task("scenes", total=len(seeds))
 
-        def finish(seed: int, written: Path, reason: str | None) -> None:
-            if reason is not None:
-                failed.append({"scene": f"seed {seed}", "failed": reason})
-                return
+        def finish(call: tuple[TakePlan | SequencePlan, int], written: Path) -> None:
             progress.advance(scenes)
-            say(out / written.relative_to(plan.out))
+            say(out / written.relative_to(call[0].out))
 
-        run_tasks(engine, deque(Task(render_seed, (plan, seed), partial(finish, seed)) for seed in seeds))
-    print_rows(failed)
+        failed = run_each(engine, render_seed, [(plan, seed) for seed in seeds], finish)
+    print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
     return 1 if failed else None
 
 

@@ -7,17 +7,15 @@ then the reference, and demodulation is consistent. Alternatively everything is 
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves
-from mcdenoise.engines import Engine, LocalEngine, Task, run_tasks
+from mcdenoise.engines import Engine, LocalEngine, run_each
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.features import RR_DEPTH, STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
@@ -185,18 +183,14 @@ def render_sequence(
             folder.note_reference(number, render_frame(job, tracer, number, advance))
         return folder.path
     paths_per_frame = (total - done) // max(len(missing), 1)
-    failed: list[tuple[int, str]] = []
 
-    def finish(number: int, state: ReferenceState | None, reason: str | None) -> None:
-        if reason is not None:
-            failed.append((number, reason))
-            return
+    def finish(call: tuple[FrameJob, int], state: ReferenceState | None) -> None:
         advance(paths_per_frame)
-        folder.note_reference(number, state)
+        folder.note_reference(call[1], state)
 
-    run_tasks(engine, deque(Task(render_frame_task, (job, number), partial(finish, number)) for number in missing))
+    failed = run_each(engine, render_frame_task, [(job, number) for number in missing], finish)
     if failed:
-        number, reason = failed[0]
+        (_, number), reason = failed[0]
         others = f"; {len(failed) - 1} more frames failed" if len(failed) > 1 else ""
         raise InputError(f"frame {number}: {reason}{others}; finished frames are kept")
     return folder.path

@@ -64,9 +64,9 @@ class TakePlan:
 
     def draw(self, number: int) -> Iterator[Take]:
         """Places for the take of a number, each for the case that those before show too little."""
-        assets, kind = self.assets.part(self.unseen), {"stills": not self.plain, "plain": self.plain}
+        assets = self.assets.part(self.unseen)
         for attempt in range(ATTEMPTS):
-            yield draw_take(number, assets, attempt, frames=self.frames, size=self.size, **kind)
+            yield draw_take(number, assets, attempt, frames=self.frames, size=self.size, plain=self.plain)
 
     def render(self, number: int) -> Path:
         """Render the take of a number, if it is not there yet.

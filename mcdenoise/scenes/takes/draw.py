@@ -100,7 +100,7 @@ def draw_take(
         frames: of a take that is no still.
         size: width and height in pixels; by default those of training.
         stills: whether it may be a still.
-        plain: whether it is sampled once at pixel centres through a pinhole, with features without noise.
+        plain: whether it is a shot, sampled once at pixel centres through a pinhole, with features without noise.
     """
     place_rng, camera_rng, move_rng, rng = (
         np.random.default_rng(child) for child in np.random.SeedSequence((number, attempt)).spawn(4)
@@ -108,7 +108,7 @@ def draw_take(
     stock = Stock(assets)
     # Another attempt is a place of the same kind, so that hard kinds are as many.
     builder, void = build(place_rng, stock, float(np.random.default_rng((number, _KIND)).random()))
-    still = rng.random() < _STILLS and stills
+    still = rng.random() < _STILLS and stills and not plain
     size = size or (_STILL if still else _CLIP)
     count = 1 if still else frames
     cameras = shoot(builder, camera_rng, count)
