@@ -39,7 +39,7 @@ CAMERA = Camera.look_at((0, 0, 4), (0, 0, 0), fov_x=40)
 
 def take_of(scene: dict[str, Any], cameras: list[Camera], **changed: Any) -> Take:
     """A take of a scene, sampled at pixel centres through a pinhole."""
-    drawn = draw_take(0, Assets(Path()), frames=1, stills=False)
+    drawn = draw_take(0, Assets(), frames=1, stills=False)
     plain = replace(drawn, scene=scene, cameras=cameras, moves={}, filter="centre", aperture=0.0)
     return replace(plain, **changed)
 
@@ -117,7 +117,7 @@ def test_texture_coordinates_are_those_of_mitsuba() -> None:
 
 @pytest.mark.parametrize("seed", [0, 2, 4])
 def test_random_scenes_are_translated_whole(seed: int, tmp_path: Path) -> None:
-    made = draw_take(seed, Assets(Path()), frames=2, stills=False)
+    made = draw_take(seed, Assets(), frames=2, stills=False)
     moves = made.moves.keys() - {"sky"}
     description = translate(made.scene, moves, seed=seed)
     objects = description.content["objects"]
@@ -401,7 +401,7 @@ def pixels(folder: Path) -> dict[str, Any]:
 
 
 def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Path) -> None:
-    drawn = draw_take(4, Assets(Path()), frames=2, stills=False)
+    drawn = draw_take(4, Assets(), frames=2, stills=False)
     assert drawn.moves.keys() - {"sky"}
     made = replace(drawn, filter="gaussian", aperture=0.0)
     options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 8, "seed": 5}

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -19,9 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, default_folder, open_assets
 from mcdenoise.scenes.generation import SequencePlan
 from mcdenoise.scenes.render import choose_variant
-from mcdenoise.scenes.takes import TakePlan
-from mcdenoise.scenes.takes.draw import FRAMES
-from mcdenoise.scenes.takes.tracing import HALF
+from mcdenoise.scenes.takes import Plan, TakePlan
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _FRAMES = 12
@@ -74,26 +71,23 @@ def generate(
         raise InputError(f"--frames: expected at least 1, found {frames}")
     if plain and not takes:
         raise InputError("--plain: expected together with --takes: the other sequences of Mitsuba are plain")
+    if takes and renderer == "cycles":
+        raise InputError("--takes: expected --renderer mitsuba, found cycles")
     chosen, workers = parse_frames(seeds, name="--seeds"), parse_workers(rendering.workers)
     arguments = {**rendering.arguments(), "workers": workers or 1}
-    plan: TakePlan | SequencePlan
+    # One variant for all machines, because it is part of the identity of a sequence.
+    variant = None if renderer == "cycles" else choose_variant(rendering.variant)
+    common: dict[str, Any] = {"out": Path(os.path.abspath(out)), "unseen": unseen}
+    common |= {"threads": threads or int(workers is None), "assets": _opened(assets)}
+    plan: Plan
     if takes:
-        if renderer == "cycles":
-            raise InputError("--takes: expected --renderer mitsuba, found cycles")
-        plan = _of_takes(Path(os.path.abspath(out)), rendering, frames, threads, _opened(assets), unseen, plain)
+        plan = TakePlan(**common, variant=str(variant), plain=plain, **_of_takes(rendering, frames))
     else:
-        plan = SequencePlan(
-            out=Path(os.path.abspath(out)),
-            assets=_opened(assets),
-            unseen=unseen,
-            frames=frames,
-            rendering=arguments,
-            cycles=renderer == "cycles",
-            parts=parts,
-            threads=threads,
-        )
+        arguments |= {"variant": variant}
+        plan = SequencePlan(**common, frames=frames, rendering=arguments, cycles=renderer == "cycles", parts=parts)
     if workers is None:
-        return _on_ray(plan, chosen, rendering.workers, out)
+        gpus = float(str(variant).startswith("cuda"))
+        return _on_ray(plan, chosen, RayEngine(rendering.workers, cpus=plan.threads, gpus=gpus), out)
     with progress_bar() as progress:
         scenes = progress.add_task("takes" if takes else "scenes", total=len(chosen))
 
@@ -106,7 +100,7 @@ def generate(
             return show
 
         for seed in chosen:
-            written = plan.render(seed) if isinstance(plan, TakePlan) else plan.render(seed, begin(f"scene {seed}"))
+            written = plan.render(seed, None if takes else begin(f"scene {seed}"))
             say(out / written.relative_to(plan.out))
             progress.advance(scenes)
     return None
@@ -114,13 +108,11 @@ def generate(
 
 def _opened(folder: str | None) -> Assets:
     if folder == _NO_ASSETS:
-        return Assets(Path())
+        return Assets()
     return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
 
-def _of_takes(
-    out: Path, rendering: RenderOptions, frames: int, threads: int, assets: Assets, unseen: bool, plain: bool
-) -> TakePlan:
+def _of_takes(rendering: RenderOptions, frames: int) -> dict[str, Any]:
     """How packed takes are rendered; options that have the defaults of sequences have those of takes."""
     given = {name: value for name, value in vars(rendering).items() if value != getattr(_FOR_TRAINING, name)}
     others = given.keys() - {"size", "reference_spp", "variant", "workers"}
@@ -128,33 +120,19 @@ def _of_takes(
         raise InputError(f"--{min(others).replace('_', '-')}: expected none beside --takes, which draws it, found one")
     if rendering.reference_spp < 2:
         raise InputError(f"--reference-spp: expected at least 2 for --takes, found {rendering.reference_spp}")
-    return TakePlan(
-        out=out,
-        assets=assets,
-        unseen=unseen,
-        variant=choose_variant(rendering.variant),
-        threads=threads,
-        frames=FRAMES if frames == _FRAMES else frames,
-        size=parse_size(rendering.size) if "size" in given else None,
-        half=rendering.reference_spp // 2 if "reference_spp" in given else HALF,
-        plain=plain,
-    )
+    return {
+        **({} if frames == _FRAMES else {"frames": frames}),
+        **({"size": parse_size(rendering.size)} if "size" in given else {}),
+        **({"half": rendering.reference_spp // 2} if "reference_spp" in given else {}),
+    }
 
 
-def _on_ray(plan: TakePlan | SequencePlan, seeds: list[int], address: str, out: Path) -> int | None:
+def _on_ray(plan: Plan, seeds: list[int], engine: RayEngine, out: Path) -> int | None:
     """Render the seeds on a Ray cluster, a task each."""
-    threads, variant = plan.threads or 1, ""
-    if isinstance(plan, TakePlan):
-        plan, variant = replace(plan, threads=threads), plan.variant
-    else:
-        # One variant for all machines, because it is part of the identity of a sequence.
-        variant = "" if plan.cycles else choose_variant(plan.rendering["variant"])
-        plan = replace(plan, threads=threads, rendering={**plan.rendering, "variant": variant or None})
-    engine = RayEngine(address, cpus=threads, gpus=float(variant.startswith("cuda")))
     with progress_bar() as progress:
         scenes = progress.add_task("scenes", total=len(seeds))
 
-        def finish(call: tuple[TakePlan | SequencePlan, int], written: Path) -> None:
+        def finish(call: tuple[Plan, int], written: Path) -> None:
             progress.advance(scenes)
             say(out / written.relative_to(call[0].out))
 
@@ -163,6 +141,6 @@ def _on_ray(plan: TakePlan | SequencePlan, seeds: list[int], address: str, out: 
     return 1 if failed else None
 
 
-def render_seed(plan: TakePlan | SequencePlan, seed: int) -> Path:
+def render_seed(plan: Plan, seed: int) -> Path:
     """A task: render what a plan makes of a seed."""
     return plan.render(seed)

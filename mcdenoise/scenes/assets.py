@@ -140,13 +140,11 @@ class Assets:
     """What scenes are drawn from.
 
     Args:
-        folder: where the files are.
         models: pieces of furniture and small objects.
         skies: files of lat-long skies.
         normals: files of normal maps.
     """
 
-    folder: Path
     models: tuple[Model, ...] = ()
     skies: tuple[Path, ...] = ()
     normals: tuple[Path, ...] = ()
@@ -165,7 +163,6 @@ class Assets:
             return (hashlib.sha256(name.encode()).digest()[0] % _PARTS == 0) == unseen
 
         return Assets(
-            self.folder,
             tuple(model for model in self.models if keep(model.name)),
             tuple(path for path in self.skies if keep(path.stem)),
             tuple(path for path in self.normals if keep(path.stem)),
@@ -197,16 +194,19 @@ def open_assets(folder: Path, say: Callable[[str], None], fetch: bool = True) ->
     except OSError as error:
         raise InputError(f"{folder}: cannot be created ({error.strerror}); choose another --assets") from error
     furniture, images = folder / _FURNITURE, folder / "images"
-    for place, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):
-        if place.is_dir() or not fetch:
+    for target, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):
+        if target.is_dir() or not fetch:
             continue
         try:
-            client(folder)
+            with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work:
+                found = client(Path(work), package)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                found.rename(target)
         except (OSError, subprocess.SubprocessError, tarfile.TarError, ValueError) as error:
             reason = str(getattr(error, "stderr", "") or error).strip().splitlines()[-1:] or ["no answer"]
             say(f"{package}: cannot be fetched ({reason[0][:200]}); scenes are made without it, of procedural objects")
     models = sorted((model for path in furniture.glob("*.sh3f") for model in _catalogue(path)), key=lambda m: m.name)
-    return Assets(folder, tuple(models), tuple(sorted(images.glob("*.exr"))), tuple(sorted(images.glob("*.webp"))))
+    return Assets(tuple(models), tuple(sorted(images.glob("*.exr"))), tuple(sorted(images.glob("*.webp"))))
 
 
 def read_sky(path: Path) -> Image:
@@ -219,34 +219,32 @@ def read_normal_map(path: Path) -> Image:
     return _read_image(read_bytes(path, _LARGEST_MEMBER), path.suffix, path)[..., :3]
 
 
-def _run(*command: str, at: str | Path) -> None:
-    subprocess.run(command, cwd=at, check=True, capture_output=True, text=True, timeout=_PATIENCE)
+def _run(work: Path, *command: str) -> None:
+    subprocess.run(command, cwd=work, check=True, capture_output=True, text=True, timeout=_PATIENCE)
 
 
-def _fetch_furniture(folder: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work:
-        _run("apt-get", "download", _DEBIAN, at=work)
-        (package,) = Path(work).glob("*.deb")
-        _run("dpkg-deb", "-x", package.name, "x", at=work)
-        target = folder / _FURNITURE
-        target.parent.mkdir(parents=True, exist_ok=True)
-        (Path(work) / "x" / _FURNITURE).rename(target)
+def _fetch_furniture(work: Path, package: str) -> Path:
+    """Fetch a package of Debian into a folder; returns the folder of its archives."""
+    _run(work, "apt-get", "download", package)
+    (file,) = work.glob("*.deb")
+    _run(work, "dpkg-deb", "-x", file.name, "x")
+    return work / "x" / _FURNITURE
 
 
-def _fetch_images(folder: Path) -> None:
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work:
-        _run("npm", "pack", _NPM, at=work)
-        (package,) = Path(work).glob("*.tgz")
-        ready = Path(work) / "images"
-        ready.mkdir()
-        with tarfile.open(package) as files:
-            for member in files:
-                found = _KEPT.fullmatch(member.name)
-                content = files.extractfile(member) if found and member.size <= _LARGEST_MEMBER else None
-                encoded = _ENCODED.search(content.read()) if content else None
-                if found and encoded:
-                    (ready / found[2]).write_bytes(base64.b64decode(encoded[1]))
-        ready.rename(folder / "images")
+def _fetch_images(work: Path, package: str) -> Path:
+    """Fetch a package of npm into a folder; returns the folder of its images."""
+    _run(work, "npm", "pack", package)
+    (file,) = work.glob("*.tgz")
+    ready = work / "images"
+    ready.mkdir()
+    with tarfile.open(file) as files:
+        for member in files:
+            found = _KEPT.fullmatch(member.name)
+            content = files.extractfile(member) if found and member.size <= _LARGEST_MEMBER else None
+            encoded = _ENCODED.search(content.read()) if content else None
+            if found and encoded:
+                (ready / found[2]).write_bytes(base64.b64decode(encoded[1]))
+    return ready
 
 
 def _catalogue(path: Path) -> Iterator[Model]:

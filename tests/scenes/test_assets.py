@@ -115,7 +115,7 @@ def test_names_in_archives_lead_nowhere(tmp_path: Path) -> None:
 
 def test_a_tenth_is_kept_apart(tmp_path: Path) -> None:
     skies = tuple(tmp_path / f"{number}.exr" for number in range(400))
-    everything = Assets(tmp_path, skies=skies)
+    everything = Assets(skies=skies)
     seen, unseen = everything.part(False).skies, everything.part(True).skies
     assert set(seen) | set(unseen) == set(skies)
     assert not set(seen) & set(unseen)
@@ -126,6 +126,6 @@ def test_without_clients_a_line_says_so(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("PATH", str(tmp_path))
     said: list[str] = []
     found = open_assets(tmp_path / "cache", said.append)
-    assert found == Assets(tmp_path / "cache")
+    assert found == Assets()
     assert len(said) == 2
     assert all("\n" not in line for line in said)

@@ -18,7 +18,7 @@ from mcdenoise.scenes.random.materials import diffuse, glass
 from mcdenoise.scenes.render.film import curve, offsets, splat
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
-NOTHING = Assets(Path("nowhere"))
+NOTHING = Assets()
 SIZE = 24, 16
 FOV = 50.0
 

@@ -30,7 +30,7 @@ CLOSE = 0.05
 
 
 def drawn(seed: int, frames: int = FRAMES) -> Take:
-    return draw_take(seed, Assets(Path()), frames=frames, stills=False)
+    return draw_take(seed, Assets(), frames=frames, stills=False)
 
 
 @functools.cache

@@ -10,8 +10,8 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.random.builder import SceneBuilder
+from mcdenoise.scenes.random.textures import Rng
 
-Rng = np.random.Generator
 # Last frame of a path; a longer shot goes back and forth.
 _HORIZON = 16
 # Minimum distance in metres to the bounding box of any object.

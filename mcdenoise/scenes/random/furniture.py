@@ -18,10 +18,8 @@ from mcdenoise.scenes.random.materials import (
     random_metal,
     random_opaque,
 )
-from mcdenoise.scenes.random.textures import picture, random_color
+from mcdenoise.scenes.random.textures import Rng, picture, random_color
 
-Rng = np.random.Generator
-Ref = dict[str, str]
 # Parts, radius, and the height of the top, 0 without one.
 Piece: TypeAlias = tuple[list[Part], float, float]
 
@@ -336,9 +334,9 @@ def _railing(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     return [*parts, box((0, 1, 0), (length, 0.04, 0.06), material)], length / 2, 0.0
 
 
-def _any(builder: SceneBuilder, rng: Rng) -> Ref:
+def _any(builder: SceneBuilder, rng: Rng) -> dict[str, str]:
     return builder.material(random_material(rng))
 
 
-def _any_opaque(builder: SceneBuilder, rng: Rng) -> Ref:
+def _any_opaque(builder: SceneBuilder, rng: Rng) -> dict[str, str]:
     return builder.material(random_opaque(rng, textured=0.25))

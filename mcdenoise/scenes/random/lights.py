@@ -10,9 +10,8 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, plate, rgb, rod, rotate, sheet
 from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaque
-from mcdenoise.scenes.random.textures import Color
+from mcdenoise.scenes.random.textures import Color, Rng
 
-Rng = np.random.Generator
 Point = tuple[float, float, float]
 _SKY_ROWS = 128
 
@@ -103,8 +102,9 @@ def light_color(rng: Rng) -> Color:
     return color[0] / mean, max(color[1], 0.02) / mean, max(color[2], 0.02) / mean
 
 
-def add_lamps(builder: SceneBuilder, rng: Rng, low: Array, high: Array, count: int, brightness: float) -> None:
+def add_lamps(builder: SceneBuilder, rng: Rng, count: int, brightness: float) -> None:
     """Add hanging, standing and hidden lamps to a room; together they light its surfaces to about ``brightness``."""
+    low, high = builder.low, builder.high
     width, height, depth = high - low
     flux = brightness * math.pi * 2 * (width * height + height * depth + depth * width) * 0.5
     for fraction in rng.dirichlet(np.full(count, 1.5)):
@@ -126,7 +126,7 @@ def add_lamps(builder: SceneBuilder, rng: Rng, low: Array, high: Array, count: i
         elif kind == "standing":
             _standing(builder, rng, (x, float(low[1]), z), float(height), power, color)
         elif kind == "cove":
-            _cove(builder, rng, low, high, power, color)
+            _cove(builder, rng, power, color)
         elif kind == "chandelier":
             _chandelier(builder, rng, (x, ceiling, z), power, color)
         else:
@@ -216,8 +216,9 @@ def _standing(builder: SceneBuilder, rng: Rng, foot: Point, height: float, power
         builder.add([rod((x, y + top - 1.4 * radius, z), (x, y + top + 1.4 * radius, z), 1.8 * radius, shade)])
 
 
-def _cove(builder: SceneBuilder, rng: Rng, low: Array, high: Array, power: float, color: Color) -> None:
+def _cove(builder: SceneBuilder, rng: Rng, power: float, color: Color) -> None:
     """A light strip behind a board under the ceiling, so that everything below is lit indirectly."""
+    low, high = builder.low, builder.high
     side = int(rng.choice([-1, 1]))
     x = float(low[0] if side < 0 else high[0]) - side * 0.12
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.textures import Color, leaf_mask, random_color, texture
+from mcdenoise.scenes.random.textures import Color, Rng, leaf_mask, random_color, texture
 
 Bsdf = dict[str, Any]
 # Reflectance of each metal at normal incidence, linear sRGB.
@@ -60,13 +60,13 @@ def pane() -> Bsdf:
     return {"type": "thindielectric", "int_ior": 1.5}
 
 
-def foliage(rng: np.random.Generator, color: Color) -> Bsdf:
+def foliage(rng: Rng, color: Color) -> Bsdf:
     """A twig of leaves, cut out of a rectangle by a mask."""
     shade = np.clip(np.array(color) * rng.uniform(0.6, 1.4, (16, 16, 1)), 0.02, 0.9)
     return {"type": "mask", "opacity": _bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
 
 
-def random_metal(rng: np.random.Generator) -> Bsdf:
+def random_metal(rng: Rng) -> Bsdf:
     """A rough metal: untinted, tinted or brushed."""
     material, alpha = str(rng.choice(list(METALS))), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
     if rng.random() < 0.25:
@@ -77,7 +77,7 @@ def random_metal(rng: np.random.Generator) -> Bsdf:
     return rough_metal(material, alpha)
 
 
-def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1), textured: float = 0.4) -> Bsdf:
+def random_opaque(rng: Rng, repeat: tuple[float, float] = (1, 1), textured: float = 0.4) -> Bsdf:
     """Paint, wood, cloth or lacquer: diffuse or coated, textured with the given probability."""
     look = texture(rng) if rng.random() < textured else random_color(rng)
     kind = rng.random()
@@ -88,7 +88,7 @@ def random_opaque(rng: np.random.Generator, repeat: tuple[float, float] = (1, 1)
     return rough_plastic(look, float(np.exp(rng.uniform(np.log(0.03), np.log(0.4)))), repeat)
 
 
-def random_material(rng: np.random.Generator) -> Bsdf:
+def random_material(rng: Rng) -> Bsdf:
     """Any material for a small closed object."""
     kind = rng.random()
     if kind < 0.66:

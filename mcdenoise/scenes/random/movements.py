@@ -8,6 +8,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.random.builder import SceneBuilder, bounds, rotate
+from mcdenoise.scenes.random.textures import Rng
 
 _NEAREST_FOCUS = 0.3
 
@@ -23,7 +24,7 @@ def distance(builder: SceneBuilder, camera: Camera) -> float:
     return float(depth[np.argmax(depth / np.linalg.norm(ways, axis=1))])
 
 
-def movements(builder: SceneBuilder, rng: np.random.Generator, frames: int, camera: Camera) -> dict[str, Array]:
+def movements(builder: SceneBuilder, rng: Rng, frames: int, camera: Camera) -> dict[str, Array]:
     """Let one to three small objects slide, swing or rotate, or let a lamp swing."""
     moves: dict[str, Array] = {}
     bulbs = [name for name in builder.lamps if _is_small(builder, [name])]
@@ -37,7 +38,7 @@ def movements(builder: SceneBuilder, rng: np.random.Generator, frames: int, came
     return moves
 
 
-def _motion(builder: SceneBuilder, rng: np.random.Generator, frames: int, names: list[str]) -> dict[str, Array]:
+def _motion(builder: SceneBuilder, rng: Rng, frames: int, names: list[str]) -> dict[str, Array]:
     """One movement for all shapes of a group; at frame 0 they are in their original place."""
     center = _center(builder, names)
     direction = rng.normal(0, 1, 3) * (1, 0.2, 1)

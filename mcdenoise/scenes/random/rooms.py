@@ -19,12 +19,13 @@ from mcdenoise.scenes.random.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.scenes.random.textures import Color, texture, wall_color
+from mcdenoise.scenes.random.textures import Color, Rng, texture, wall_color
 
-Rng = np.random.Generator
 # A room with more shapes than this gets no more furniture.
 _ENOUGH_SHAPES = 290
 _WALL = 0.25
+# Probability of blinds or curtains: light through them takes more samples than a reference has.
+_DRESSED = 0.2
 
 
 def still_life(rng: Rng) -> SceneBuilder:
@@ -134,7 +135,7 @@ def light_experiment(rng: Rng) -> SceneBuilder:
     return builder
 
 
-def empty_room(rng: Rng) -> tuple[SceneBuilder, Array]:
+def empty_room(rng: Rng) -> SceneBuilder:
     """Floor, ceiling, beams and pillars; the walls are added later."""
     large = rng.random() < 0.25
     size = rng.uniform((2.4, 2.3, 3.0), (5.5, 3.2, 6.5)) * ((1.6, 1.4, 1.6) if large else (1, 1, 1))
@@ -157,14 +158,14 @@ def empty_room(rng: Rng) -> tuple[SceneBuilder, Array]:
         rug = builder.material(random_opaque(rng, textured=0.95))
         where = (*(rng.uniform(-0.15, 0.15, 1) * width), 0.006, 0.0)
         builder.add([box(where, (width * rng.uniform(0.3, 0.7), 0.012, depth * rng.uniform(0.3, 0.6)), rug)])
-    return builder, size
+    return builder
 
 
-def _wall_frame(size: Array, wall: int) -> tuple[Array, float]:
-    """Placement of a wall (+z points into the room, y = 0 is the floor), and its length."""
-    width, _, depth = size
+def _wall_frame(builder: SceneBuilder, wall: int) -> tuple[Array, float, float]:
+    """Placement of a wall (+z points into the room, y = 0 is the floor), its length and its height."""
+    width, height, depth = builder.high - builder.low
     position = [(0, 0, -depth / 2), (-width / 2, 0, 0), (0, 0, depth / 2), (width / 2, 0, 0)][wall]
-    return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth)
+    return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth), float(height)
 
 
 def outwards(wall: int) -> float:
@@ -172,10 +173,9 @@ def outwards(wall: int) -> float:
     return (180.0, -90.0, 0.0, 90.0)[wall]
 
 
-def closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None:
+def closed_wall(builder: SceneBuilder, rng: Rng, wall: int) -> None:
     """A wall without windows, with pictures, and at times a door."""
-    frame, length = _wall_frame(size, wall)
-    height = float(size[1])
+    frame, length, height = _wall_frame(builder, wall)
     look = texture(rng) if rng.random() < 0.35 else wall_color(rng)
     surface = builder.material(_coat(rng, look, repeat=(float(rng.integers(1, 5)), float(rng.integers(1, 4)))))
     parts = [box((0, height / 2, -_WALL / 2), (length + 2 * _WALL, height, _WALL), surface)]
@@ -194,21 +194,16 @@ def closed_wall(builder: SceneBuilder, rng: Rng, size: Array, wall: int) -> None
         builder.points.append((frame @ where)[:3, 3])
 
 
-def wall_with_windows(
-    builder: SceneBuilder, rng: Rng, size: Array, wall: int, dressed: float, glow: Color | None = None
-) -> float:
+def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | None = None) -> float:
     """A wall with a row of windows with bars; returns the windows' area.
 
     Args:
         builder: collects the objects.
         rng: the source of randomness.
-        size: of the room.
         wall: 0 to 3.
-        dressed: probability of blinds or curtains.
         glow: radiance of a sheet behind each window, instead of what is outside.
     """
-    frame, length = _wall_frame(size, wall)
-    height = float(size[1])
+    frame, length, height = _wall_frame(builder, wall)
     count = int(rng.integers(1, 4)) if length > 3 else 1
     sill = float(rng.choice([0.0, rng.uniform(0.3, 1.1)], p=[0.2, 0.8]))
     top = float(rng.uniform(0.75, 0.95)) * height
@@ -228,7 +223,7 @@ def wall_with_windows(
         parts.append(box(middle, (right - left, top - sill, _WALL), surface))
     columns, rows = (int(n) for n in rng.integers(0, 4, 2))
     glazed = rng.random() < 0.12
-    dressing = rng.choice(["none", "blinds", "curtains"], p=[1 - dressed, 0.4 * dressed, 0.6 * dressed])
+    dressing = rng.choice(["none", "blinds", "curtains"], p=[1 - _DRESSED, 0.4 * _DRESSED, 0.6 * _DRESSED])
     tall = top - sill
     for x in middles:
         for n in range(columns):

@@ -15,9 +15,8 @@ from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
 from mcdenoise.scenes.random.furniture import glass_block, ornament
 from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, lacquer, mirror, pane, random_metal, rough_plastic
-from mcdenoise.scenes.random.textures import planks, texture
+from mcdenoise.scenes.random.textures import Rng, planks, texture
 
-Rng = np.random.Generator
 # Minimum area in square metres of a floor, a wall or a table top.
 _LARGE = 0.3
 # Weight of a shiny object among the points that a camera looks at.
@@ -25,12 +24,13 @@ _WEIGHT = 3
 
 
 def shine(builder: SceneBuilder, rng: Rng) -> None:
-    """Coat diffuse materials, and add one to four shiny objects where cameras will look."""
+    """Coat diffuse materials, and add one to four shiny objects, each of which says where cameras will look."""
     areas = builder.areas()
     builder.change_materials(lambda name, bsdf: _coated(rng, bsdf, areas.get(name, 0.0) > _LARGE))
     adders = [_wall_mirror, _wall_mirror, _vitrine, _standing_pane, _jewels, _lacquered_box, _glass_picture]
     for _ in range(int(rng.integers(1, 5))):
-        adders[int(rng.integers(len(adders)))](builder, rng)
+        point = adders[int(rng.integers(len(adders)))](builder, rng)
+        builder.points.extend([point] * _WEIGHT)
 
 
 def _coated(rng: Rng, bsdf: Bsdf, large: bool) -> Bsdf:
@@ -70,10 +70,6 @@ def _contrast(rng: Rng, image: Array) -> Array:
     return np.asarray(np.clip(mean + factor * (image - mean), 0.01, 0.9))
 
 
-def _look_at(builder: SceneBuilder, point: Array) -> None:
-    builder.points.extend([point] * _WEIGHT)
-
-
 def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
     """A place on one of the four sides, with +z inwards, and the width and height of that side."""
     low, high = builder.low, builder.high
@@ -93,7 +89,7 @@ def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
     return place((float(x), float(y), float(z)), (0, 90, 180, -90)[wall]), width, height
 
 
-def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
+def _wall_mirror(builder: SceneBuilder, rng: Rng) -> Array:
     """A mirror on a wall, sometimes slightly rough or tilted, with or without a frame."""
     frame, width, height = _wall_place(builder, rng)
     half_size = rng.uniform(0.2, 0.5) * min(width, 3.0), rng.uniform(0.25, 0.42) * min(height, 2.6)
@@ -106,10 +102,10 @@ def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
         for side in (-1, 1):
             parts.append(box((side * (half_size[0] + 0.03), 0, 0.05), (0.06, 2 * half_size[1] + 0.1, 0.08), rim))
     builder.add(parts, frame)
-    _look_at(builder, frame[:3, 3])
+    return np.asarray(frame[:3, 3])
 
 
-def _glass_picture(builder: SceneBuilder, rng: Rng) -> None:
+def _glass_picture(builder: SceneBuilder, rng: Rng) -> Array:
     """A large textured panel on a wall behind glass."""
     frame, width, height = _wall_place(builder, rng)
     half_size = rng.uniform(0.2, 0.4) * min(width, 3.0), rng.uniform(0.2, 0.4) * min(height, 2.6)
@@ -119,7 +115,7 @@ def _glass_picture(builder: SceneBuilder, rng: Rng) -> None:
         sheet((0, 0, float(rng.uniform(0.05, 0.3))), half_size, builder.material(pane()), np.eye(4)),
     ]
     builder.add(parts, frame)
-    _look_at(builder, frame[:3, 3])
+    return np.asarray(frame[:3, 3])
 
 
 def _spot(builder: SceneBuilder, rng: Rng) -> Array:
@@ -130,7 +126,7 @@ def _spot(builder: SceneBuilder, rng: Rng) -> Array:
     return np.asarray(where)
 
 
-def _standing_pane(builder: SceneBuilder, rng: Rng) -> None:
+def _standing_pane(builder: SceneBuilder, rng: Rng) -> Array:
     """A standing screen of thin or thick glass through which the background is visible."""
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
     wide, tall = rng.uniform(0.4, 1.2), rng.uniform(0.5, 1.0) * min(float(builder.high[1]) - 0.1, 1.9)
@@ -143,10 +139,10 @@ def _standing_pane(builder: SceneBuilder, rng: Rng) -> None:
     for side in (-1, 1):
         parts.append(rod((side * wide / 2, 0, 0), (side * wide / 2, tall, 0), 0.015, rim))
     builder.add(parts, place(where, turn))
-    _look_at(builder, where + np.array((0, tall / 2, 0)))
+    return np.asarray(where + np.array((0, tall / 2, 0)))
 
 
-def _vitrine(builder: SceneBuilder, rng: Rng) -> None:
+def _vitrine(builder: SceneBuilder, rng: Rng) -> Array:
     """Ornaments on a block under a glass box."""
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
     edge, base = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.05, 0.8))
@@ -162,10 +158,10 @@ def _vitrine(builder: SceneBuilder, rng: Rng) -> None:
     frame = place(where, turn)
     builder.add(parts, frame)
     builder.add(ornament(builder, rng, 0.8 * edge), frame @ place((0, base + 0.002, 0)))
-    _look_at(builder, where + np.array((0, base + edge / 2, 0)))
+    return np.asarray(where + np.array((0, base + edge / 2, 0)))
 
 
-def _jewels(builder: SceneBuilder, rng: Rng) -> None:
+def _jewels(builder: SceneBuilder, rng: Rng) -> Array:
     """Balls, cylinders and blocks of glass, mirror and metal next to each other on a glossy plate."""
     where = _spot(builder, rng)
     radius, height = float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.02, 0.7))
@@ -191,10 +187,10 @@ def _jewels(builder: SceneBuilder, rng: Rng) -> None:
             if rng.random() < 0.3:
                 parts = drum((0, 0, 0), size, 0.3 * size, material)
         builder.add(parts, spot, movable=True)
-    _look_at(builder, where + np.array((0, height + 0.1, 0)))
+    return np.asarray(where + np.array((0, height + 0.1, 0)))
 
 
-def _lacquered_box(builder: SceneBuilder, rng: Rng) -> None:
+def _lacquered_box(builder: SceneBuilder, rng: Rng) -> Array:
     """A chest or a low table of dark lacquered wood that reflects the objects on it."""
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
     wide, deep, tall = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.0), rng.uniform(0.1, 0.7)
@@ -210,4 +206,4 @@ def _lacquered_box(builder: SceneBuilder, rng: Rng) -> None:
     for _ in range(int(rng.integers(1, 4))):
         spot = place((rng.uniform(-0.35, 0.35) * wide, tall, rng.uniform(-0.3, 0.3) * deep), rng.uniform(0, 360))
         builder.add(ornament(builder, rng, float(rng.uniform(0.12, 0.4))), frame @ spot, movable=True)
-    _look_at(builder, where + np.array((0, tall, 0)))
+    return np.asarray(where + np.array((0, tall, 0)))

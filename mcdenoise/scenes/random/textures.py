@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from mcdenoise.data.camera_path import Array
 
 Color = tuple[float, float, float]
+Rng = np.random.Generator
 
 
-def random_color(rng: np.random.Generator) -> Color:
+def random_color(rng: Rng) -> Color:
     """A reflectance: neutral, pastel, saturated, dark or bright."""
     hue = float(rng.random())
     kind = rng.choice(["neutral", "pastel", "saturated", "dark", "wood"], p=[0.3, 0.25, 0.2, 0.1, 0.15])
@@ -33,7 +34,7 @@ def random_color(rng: np.random.Generator) -> Color:
     return max(red, 0.02), max(green, 0.02), max(blue, 0.02)
 
 
-def wall_color(rng: np.random.Generator) -> Color:
+def wall_color(rng: Rng) -> Color:
     """A bright paint in most cases, for indirect light; sometimes any color."""
     if rng.random() < 0.25:
         return random_color(rng)
@@ -41,21 +42,21 @@ def wall_color(rng: np.random.Generator) -> Color:
     return red, green, blue
 
 
-def texture(rng: np.random.Generator) -> Array:
+def texture(rng: Rng) -> Array:
     """A random pattern in random colours and at a random scale."""
-    plain: tuple[Callable[[np.random.Generator], Array], ...] = (checker, tiles, tiles, planks, planks, stripes, dots)
+    plain: tuple[Callable[[Rng], Array], ...] = (checker, tiles, tiles, planks, planks, stripes, dots)
     patterns = (*plain, marble, marble, wallpaper, glyphs, picture)
     return patterns[int(rng.integers(len(patterns)))](rng)
 
 
-def checker(rng: np.random.Generator) -> Array:
+def checker(rng: Rng) -> Array:
     """Squares of two colours."""
     y, x = _grid(_side(rng))
     cells = 2 * int(rng.integers(1, 9))
     return _mix((np.floor(x * cells) + np.floor(y * cells)) % 2, rng)
 
 
-def tiles(rng: np.random.Generator) -> Array:
+def tiles(rng: Rng) -> Array:
     """Tiles or bricks of uneven tone with grout between them."""
     y, x = _grid(_side(rng))
     rows, columns = (int(n) for n in rng.integers(2, 13, 2))
@@ -70,7 +71,7 @@ def tiles(rng: np.random.Generator) -> Array:
     return _reflectance(np.where(joint[..., None], random_color(rng), stone[..., None] * random_color(rng)))
 
 
-def planks(rng: np.random.Generator) -> Array:
+def planks(rng: Rng) -> Array:
     """Boards with wood grain and gaps."""
     y, x = _grid(_side(rng))
     boards, pieces = int(rng.integers(3, 14)), int(rng.integers(1, 4))
@@ -82,7 +83,7 @@ def planks(rng: np.random.Generator) -> Array:
     return _reflectance((tone * grain * np.where(gap, 0.3, 1))[..., None] * random_color(rng))
 
 
-def stripes(rng: np.random.Generator) -> Array:
+def stripes(rng: Rng) -> Array:
     """Soft or hard lines at a random angle."""
     y, x = _grid(_side(rng))
     waves = rng.integers(-12, 13, 2)
@@ -93,7 +94,7 @@ def stripes(rng: np.random.Generator) -> Array:
     return _mix(np.where(wave > rng.uniform(-0.7, 0.7), 1.0, 0.0) if hard else 0.5 + 0.5 * wave, rng)
 
 
-def dots(rng: np.random.Generator) -> Array:
+def dots(rng: Rng) -> Array:
     """Round dots on a regular grid."""
     y, x = _grid(_side(rng))
     count = int(rng.integers(2, 14))
@@ -101,7 +102,7 @@ def dots(rng: np.random.Generator) -> Array:
     return _mix((distance < rng.uniform(0.12, 0.42)) * 1.0, rng)
 
 
-def marble(rng: np.random.Generator) -> Array:
+def marble(rng: Rng) -> Array:
     """Smooth noise of several octaves, unchanged or folded into veins."""
     side = _side(rng)
     first, gain = int(2 ** rng.integers(1, 6)), rng.uniform(0.35, 0.8)
@@ -118,7 +119,7 @@ def marble(rng: np.random.Generator) -> Array:
     return _mix(np.clip(0.5 + contrast * (value - value.mean()), 0, 1), rng)
 
 
-def wallpaper(rng: np.random.Generator) -> Array:
+def wallpaper(rng: Rng) -> Array:
     """Ornaments from products of waves."""
     y, x = _grid(_side(rng))
     m, n, k = (int(number) for number in rng.integers(1, 7, 3))
@@ -127,7 +128,7 @@ def wallpaper(rng: np.random.Generator) -> Array:
     return _mix((wave > rng.uniform(-0.4, 0.8)) * 1.0, rng)
 
 
-def glyphs(rng: np.random.Generator) -> Array:
+def glyphs(rng: Rng) -> Array:
     """Lines of small random signs that resemble print."""
     side, cell = 256, int(rng.choice([8, 12, 16]))
     page = np.zeros((side, side))
@@ -139,7 +140,7 @@ def glyphs(rng: np.random.Generator) -> Array:
     return _mix(page, rng)
 
 
-def picture(rng: np.random.Generator) -> Array:
+def picture(rng: Rng) -> Array:
     """Coloured noise with the spectrum of photographs, overlaid with a few flat shapes."""
     side = _side(rng)
     frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side)[None])
@@ -164,7 +165,7 @@ def picture(rng: np.random.Generator) -> Array:
     return _reflectance(image)
 
 
-def leaf_mask(rng: np.random.Generator) -> Array:
+def leaf_mask(rng: Rng) -> Array:
     """Opacity ``(H, W, 1)`` of a twig with pointed leaves, 0 or 1."""
     side = 64
     y, x = _grid(side)
@@ -191,11 +192,11 @@ def _grid(side: int) -> tuple[Array, Array]:
     return y, x
 
 
-def _side(rng: np.random.Generator) -> int:
+def _side(rng: Rng) -> int:
     return int(rng.choice([64, 128, 256], p=[0.2, 0.4, 0.4]))
 
 
-def _noise(side: int, cells: int, rng: np.random.Generator) -> Array:
+def _noise(side: int, cells: int, rng: Rng) -> Array:
     """Value noise in [0, 1]: random numbers at the corners of a periodic grid, smoothly interpolated."""
     corners = rng.random((cells, cells))
     position = np.arange(side) * cells / side
@@ -207,7 +208,7 @@ def _noise(side: int, cells: int, rng: np.random.Generator) -> Array:
     return np.asarray(rows[:, low] * (1 - part) + rows[:, high] * part)
 
 
-def _mix(weight: NDArray[np.floating[Any]], rng: np.random.Generator) -> Array:
+def _mix(weight: NDArray[np.floating[Any]], rng: Rng) -> Array:
     first, second = random_color(rng), random_color(rng)
     if rng.random() < 0.5:
         # Shades of one colour are more common than two colours.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,10 +19,10 @@ from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.takes.draw import FRAMES, REFERENCES, Take, draw_take
 from mcdenoise.scenes.takes.tracing import HALF, TakeTracer
 
-__all__ = ["ATTEMPTS", "TakePlan", "first_worth"]
+__all__ = ["Plan", "TakePlan"]
 
 Frame: TypeAlias = dict[str, Array]
-ATTEMPTS = 6
+_ATTEMPTS = 6
 # Largest SMAPE between two means of eight samples: with more, the references are noise, too.
 _NOISIEST = 0.65
 _MIDDLE = 0.2
@@ -30,27 +30,56 @@ _BLOCK = 8
 
 
 @dataclass(frozen=True, kw_only=True)
-class TakePlan:
-    """How takes are rendered.
+class Plan:
+    """What is rendered of each of many numbers: each is a task that any machine can do.
 
     Args:
-        out: folder of the files.
+        out: folder of the files; what is finished in it is kept.
         assets: what scenes are made of.
         unseen: whether only from the tenth of the assets that is never trained on.
-        variant: of Mitsuba.
-        threads: 0 for all processors.
-        frames: of a take that is no still.
-        size: width and height in pixels; by default those of training.
-        half: samples a pixel of each half of a reference.
-        plain: whether takes are shots of one sample at pixel centres, with features without noise.
+        frames: of a clip.
+        threads: of the renderer; 0 for all processors.
     """
 
     out: Path
     assets: Assets
     unseen: bool
-    variant: str
-    threads: int = 0
     frames: int = FRAMES
+    threads: int = 0
+
+    def draws(self, number: int, **settings: Any) -> Iterator[Take]:
+        """Places for a number, each for the case that those before show too little; see :func:`draw_take`."""
+        assets = self.assets.part(self.unseen)
+        for attempt in range(_ATTEMPTS):
+            yield draw_take(number, assets, attempt, frames=self.frames, **settings)
+
+    def first_worth(self, number: int, variant: str, half: int = HALF, **settings: Any) -> tuple[TakeTracer, Frame]:
+        """The first draw that is worth its references, or the last one: its tracer, and its last noisy frame."""
+        for take in self.draws(number, **settings):
+            tracer, last = TakeTracer(take, variant, self.threads, half), len(take.cameras) - 1
+            tracer.place(last)
+            final = tracer.noisy(last)
+            if _shows_enough(final, take.void) and tracer.noise(last) < _NOISIEST:
+                break
+        return tracer, final
+
+    def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
+        """Render what a number is, and return its file or folder; progress gets finished and all samples a pixel."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakePlan(Plan):
+    """How takes are rendered.
+
+    Args:
+        variant: of Mitsuba.
+        size: width and height in pixels; by default those of training.
+        half: samples a pixel of each half of a reference.
+        plain: whether takes are shots of one sample at pixel centres, with features without noise.
+    """
+
+    variant: str
     size: tuple[int, int] | None = None
     half: int = HALF
     plain: bool = False
@@ -62,14 +91,12 @@ class TakePlan:
         own = {"unseen": self.unseen, "assets": self.assets.digest, "frames": self.frames, "size": size}
         return {"takes": 1, **own, **({"plain": True} if self.plain else {}), "reference_spp": 2 * self.half}
 
-    def draw(self, number: int) -> Iterator[Take]:
-        """Places for the take of a number, each for the case that those before show too little."""
-        assets = self.assets.part(self.unseen)
-        for attempt in range(ATTEMPTS):
-            yield draw_take(number, assets, attempt, frames=self.frames, size=self.size, plain=self.plain)
-
-    def render(self, number: int) -> Path:
+    def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
         """Render the take of a number, if it is not there yet.
+
+        Args:
+            number: of the take.
+            progress: not called: a take is short.
 
         Returns:
             Its file.
@@ -82,17 +109,6 @@ class TakePlan:
         if not path.exists():
             _render(self, number, path)
         return path
-
-
-def first_worth(draws: Iterable[Take], tracer_of: Callable[[Take], TakeTracer]) -> tuple[Take, TakeTracer, Frame]:
-    """The first draw that is worth its references, or the last one; its tracer, and its last noisy frame."""
-    for take in draws:
-        tracer, last = tracer_of(take), len(take.cameras) - 1
-        tracer.place(last)
-        final = tracer.noisy(last)
-        if _shows_enough(final, take.void) and tracer.noise(last) < _NOISIEST:
-            break
-    return take, tracer, final
 
 
 def _claim(plan: TakePlan) -> None:
@@ -113,9 +129,8 @@ def _claim(plan: TakePlan) -> None:
 
 
 def _render(plan: TakePlan, number: int, path: Path) -> None:
-    takes = plan.draw(number)
-    take, tracer, final = first_worth(takes, lambda take: TakeTracer(take, plan.variant, plan.threads, plan.half))
-    last = len(take.cameras) - 1
+    tracer, final = plan.first_worth(number, plan.variant, plan.half, size=plan.size, plain=plan.plain)
+    take, last = tracer.take, len(tracer.take.cameras) - 1
     arrays = {name: np.empty((last + 1, *image.shape), np.float32) for name, image in final.items()}
     references = min(REFERENCES, last + 1)
     means, errors = [], []

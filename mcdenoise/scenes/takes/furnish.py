@@ -16,9 +16,7 @@ from mcdenoise.scenes.random.furniture import ornament
 from mcdenoise.scenes.random.lights import light_color
 from mcdenoise.scenes.random.materials import Bsdf, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
 from mcdenoise.scenes.random.rooms import furnish
-
-Rng = np.random.Generator
-Ref = dict[str, str]
+from mcdenoise.scenes.random.textures import Rng
 
 # Triangles of a scene, which bound the memory and the time to build it.
 _ENOUGH = 500_000

@@ -22,13 +22,10 @@ from mcdenoise.scenes.random.rooms import (
     wall_with_windows,
 )
 from mcdenoise.scenes.random.shiny import shine
-from mcdenoise.scenes.random.textures import Color, random_color
+from mcdenoise.scenes.random.textures import Color, Rng, random_color
 from mcdenoise.scenes.takes.furnish import Floor, Stock, add_model, bumpy, fill_room, fill_top
 
-Rng = np.random.Generator
 _BUMPY, _FINE, _SHINY = 0.2, 0.12, 0.35
-# Light through blinds takes more samples than a reference has.
-_DRESSED = 0.2
 # Fraction of day rooms whose windows are lights themselves, which takes fewer samples than a sky behind them.
 _GLOWING = 0.5
 
@@ -98,13 +95,13 @@ def any_sky(rng: Rng, stock: Stock, level: float, sun: Array | None, ratio: floa
 
 def _room(rng: Rng, windows: list[int], glow: Color | None = None) -> tuple[SceneBuilder, float]:
     """A room without furniture, and the area of its windows."""
-    builder, size = empty_room(rng)
+    builder = empty_room(rng)
     opening = 0.0
     for wall in range(4):
         if wall in windows:
-            opening += wall_with_windows(builder, rng, size, wall, _DRESSED, glow)
+            opening += wall_with_windows(builder, rng, wall, glow)
         else:
-            closed_wall(builder, rng, size, wall)
+            closed_wall(builder, rng, wall)
     return builder, opening
 
 
@@ -125,7 +122,7 @@ def _day(rng: Rng, stock: Stock) -> SceneBuilder:
         builder.set_sky(any_sky(rng, stock, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     lamps = rng.random() < 0.25
     if lamps:
-        add_lamps(builder, rng, builder.low, builder.high, int(rng.integers(1, 3)), 0.1)
+        add_lamps(builder, rng, int(rng.integers(1, 3)), 0.1)
     fill_room(builder, rng, stock, 0.1 * _surface(builder) if lamps else 0.0)
     return builder
 
@@ -136,7 +133,7 @@ def _evening(rng: Rng, stock: Stock) -> SceneBuilder:
     builder, _ = _room(rng, windows)
     if windows:
         builder.set_sky(any_sky(rng, stock, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
-    add_lamps(builder, rng, builder.low, builder.high, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
+    add_lamps(builder, rng, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
     fill_room(builder, rng, stock, 0.5 * _surface(builder))
     return builder
 
