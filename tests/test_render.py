@@ -21,6 +21,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
+from mcdenoise.scenes.random.builder import place, rotate
 from mcdenoise.scenes.render import Camera, render_sequence, view_projection
 from mcdenoise.scenes.render import frames as render_frames
 from mcdenoise.scenes.render.loading import LLVM, first_working
@@ -302,7 +303,7 @@ def test_bad_scenes_and_folders(tmp_path: Path) -> None:
     fails(broken, r"broken\.xml: Mitsuba cannot load it")
     fails({"type": "scene", "a": {"type": "nonsense"}}, "scene dictionary: Mitsuba cannot load it")
     fails({"type": "sphere"}, "expected a Mitsuba scene")
-    fails(_furnace(), "cannot be created", out=file)
+    fails(_furnace(), "expected a folder", out=file)
 
 
 @pytest.mark.usefixtures("without_mitsuba")
@@ -452,17 +453,13 @@ def _moving_scene() -> dict[str, Any]:
 
     spots = {"type": "bitmap", "bitmap": colors, "raw": True, "filter_type": "nearest"}
     grey = {"type": "rgb", "value": 0.5}
-    lying = np.eye(4)
-    lying[:3, :3] = [[9, 0, 0], [0, 0, 9], [0, -9, 0]]
-    place = np.eye(4)
-    place[:3] = [[0.5, 0, 0, 1.3], [0, 0.5, 0, 0.6], [0, 0, 0.5, 0.2]]
-    post = np.eye(4)
-    post[:3] = [[0.2, 0, 0, 2.6], [0, 1.0, 0, 1.0], [0, 0, 0.2, -1.0]]
+    lying = place((0, 0, 0), scale=(9, 9, 9), rotation=rotate("x", -90))
+    box, post = place((1.3, 0.6, 0.2), scale=(0.5, 0.5, 0.5)), place((2.6, 1, -1), scale=(0.2, 1, 0.2))
     return {
         "type": "scene",
         "floor": {"type": "rectangle", "to_world": lying, "bsdf": paint(grey)},
         "ball": {"type": "sphere", "center": [-1.2, 0.8, 0.0], "radius": 0.8, "bsdf": paint(spots)},
-        "box": {"type": "cube", "to_world": place, "bsdf": paint(spots)},
+        "box": {"type": "cube", "to_world": box, "bsdf": paint(spots)},
         "post": {"type": "cube", "to_world": post, "bsdf": paint(spots)},
         "lamp": {"type": "point", "position": [0.0, 5.0, 3.0], "intensity": {"type": "rgb", "value": 60.0}},
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
@@ -472,11 +469,8 @@ def _moving_scene() -> dict[str, Any]:
 def _moves() -> dict[str, np.ndarray[Any, Any]]:
     moves = {name: np.tile(np.eye(4), (FLIGHT, 1, 1)) for name in ("ball", "box", "lamp")}
     for frame in range(FLIGHT):
-        angle = 0.1 * frame
-        turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
         moves["ball"][frame, :3, 3] = 0.25 * frame, 0.1 * frame, 0.3 * frame
-        moves["box"][frame, :3, :3] = turn
-        moves["box"][frame, :3, 3] = -0.2 * frame, 0, 0
+        moves["box"][frame] = place((-0.2 * frame, 0, 0), turn=6 * frame)
         moves["lamp"][frame, :3, 3] = frame, 0, 0
     return moves
 
@@ -489,8 +483,8 @@ def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _render_moving(out: Path, **settings: Any) -> Path:
     cameras = [Camera.look_at((0.1 * n, 2, 6), (0.05 * n, 0.8, 0), fov_x=50) for n in range(FLIGHT)]
-    size = {"size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
-    return render_sequence(_moving_scene(), cameras, out, moves=_moves(), **{**size, **settings})
+    usual: dict[str, Any] = {"moves": _moves(), "size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
+    return render_sequence(_moving_scene(), cameras, out, **{**usual, **settings})
 
 
 def test_static_points_have_no_motion(moving: Path) -> None:
@@ -551,12 +545,10 @@ def test_the_path_of_an_object_cannot_change(moving: Path, tmp_path: Path) -> No
     shutil.copytree(moving, folder)
     moves = _moves()
     moves["ball"][1, 0, 3] += 1
-    cameras = [Camera.look_at((0.1 * n, 2, 6), (0.05 * n, 0.8, 0), fov_x=50) for n in range(FLIGHT)]
-    settings = {"size": (36, 24), "variant": "scalar_rgb", "reference_spp": 4}
     with pytest.raises(InputError, match=r"object 'ball' .*frame 1"):
-        render_sequence(_moving_scene(), cameras, tmp_path, moves=moves, **settings)
+        _render_moving(tmp_path, moves=moves)
     with pytest.raises(InputError, match="ball, box, lamp"):
-        render_sequence(_moving_scene(), cameras, tmp_path, **settings)
+        _render_moving(tmp_path, moves={})
 
 
 def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:

@@ -160,8 +160,7 @@ def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     for seed in range(3):
         made = drawn(seed)
-        stage = Stage(made.scene, "scalar_rgb", made.moves)
-        tracer = SequenceTracer(stage, made.cameras, (8, 8), None, 8, stage.reach(made.cameras))
+        tracer = SequenceTracer(Stage(made.scene, "scalar_rgb", made.moves), made.cameras, (8, 8), None, 8)
         tracer.place(FRAMES - 1)
         found = tracer.features(FRAMES - 1)
         distance = np.linalg.norm(found["position"] - made.cameras[-1].to_world[:3, 3], axis=1)

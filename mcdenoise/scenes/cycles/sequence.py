@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
@@ -24,13 +23,15 @@ from mcdenoise.data.exr import Image
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
+from mcdenoise.data.readers.files import as_tensor
 from mcdenoise.data.readers.layers import layers_of, read_layers
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
-from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder, describe, write_noisy, write_reference
+from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder, write_noisy, write_reference
 from mcdenoise.scenes.render.sequence import check_lowest
+from mcdenoise.scenes.render.stage import to_previous
 from mcdenoise.scenes.takes.draw import Take
 
 _PASSES = ("Combined", "Denoising Albedo", "Denoising Normal", "Depth", "Position", "IndexOB")
@@ -103,8 +104,8 @@ def render_cycles(
         InputError: a setting is invalid, Cycles does not support a part of the scene, Blender failed, or ``out`` cannot
             be written or holds a sequence with other settings.
     """
-    check_lowest(noise_seeds=(noise_seeds, 1), reference_samples=(reference_samples, 0), threads=(threads, 0))
-    check_lowest(seed=(seed, 0), samples=(samples, 1))
+    check_lowest(1, samples=samples, noise_seeds=noise_seeds)
+    check_lowest(0, reference_samples=reference_samples, threads=threads, seed=seed)
     count = len(take.cameras)
     if shutter is None:
         blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
@@ -118,12 +119,14 @@ def render_cycles(
     movers = [name for name in take.scene if name in moves]
     description = translate(take.scene, movers, seed=seed)
     scale = _extent(take)
-    described = describe(
+    folder = SequenceFolder(
+        out,
         take.scene,
         take.cameras,
         size,
         (1e-3 * scale, 2 * _SKY * scale),
         moves,
+        _CONVENTIONS,
         renderer=f"Blender {blender.version}, Cycles",
         noisy_spp=samples,
         film=dict(settings),
@@ -131,7 +134,6 @@ def render_cycles(
         seed=seed,
         position_limit_squared=(0.005 * scale) ** 2,
     )
-    folder = SequenceFolder(out, described, _CONVENTIONS)
     # The color is written last.
     last = {*_FEATURES, "specular" if parts else "color", "color"}
 
@@ -167,12 +169,12 @@ def render_cycles(
             file.unlink()
             advance(samples)
             buffers = buffers_of(images, take.cameras[number], back)
-            return {name: _tensor(image) for name, image in buffers.items()}
+            return {name: as_tensor(image) for name, image in buffers.items()}
 
         # Render images with few samples first: a scene that stays in Cycles keeps the sampling pattern of the largest
         # number of samples so far, and the noise of a frame must not depend on previous renderings.
         for number, noise_seed in noisy:
-            back = {index + 1: _back(moves[name], number) for index, name in enumerate(movers)}
+            back = {index + 1: to_previous(moves[name], number) for index, name in enumerate(movers)}
             found = shot(number, samples, 1 + noise_seed if noise_seed else 0, back)
             write_noisy(folder.path, number, noise_seed, found)
         for number in clean:
@@ -223,11 +225,6 @@ def buffers_of(images: Mapping[str, Image], camera: Camera, back: Mapping[int, A
     return {**buffers, "color": images["Combined"][..., :3]}
 
 
-def _back(move: Array, number: int) -> Array:
-    """Transform of an object from a frame to the previous one; the identity for the first frame."""
-    return np.asarray(move[max(number - 1, 0)] @ np.linalg.inv(move[number]))
-
-
 def _for_blender(take: Take, moves: Mapping[str, Array]) -> dict[str, Any]:
     """Placements from one frame before the first to one after the last."""
     fovs = [camera.fov_x for camera in take.cameras]
@@ -271,7 +268,3 @@ def _extent(take: Take) -> float:
     shapes = [entry for entry in take.scene.values() if isinstance(entry, Mapping) and "to_world" in entry]
     away = [float(np.linalg.norm(np.asarray(shape["to_world"])[:3, 3] - eye)) for shape in shapes]
     return float(np.median(away or [1.0]))
-
-
-def _tensor(image: Image | Array) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]

@@ -26,7 +26,8 @@ class SequenceTracer(Tracer):
         size: width and height in pixels.
         film: filter and lens; without one all samples are at the pixel centre.
         max_depth: longest path, in segments.
-        reach: distance of the background in scene units.
+
+    ``reach`` is the distance of the background in scene units.
     """
 
     def __init__(
@@ -36,7 +37,6 @@ class SequenceTracer(Tracer):
         size: tuple[int, int],
         film: Film | None,
         max_depth: int,
-        reach: float,
     ) -> None:
         mi = stage.mitsuba
         bsdfs = [shape.bsdf() for shape in stage.scene.shapes()]
@@ -44,19 +44,12 @@ class SequenceTracer(Tracer):
         clear = any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
         layers = _LAYERS if clear else 0
         super().__init__(stage, cameras, size, film or Film("centre"), (max_depth, RR_DEPTH), layers=layers)
-        self._exact, self._reach = film is None, reach
+        self.exact, self.reach = film is None, stage.reach(cameras)
         self.paths_per_pass = _SCALAR_PASS if stage.scalar else max(1, WAVEFRONT // (size[0] * size[1]))
-
-    def radiance(self, frame: int, paths: int, seed: Sequence[int], stratified: bool = False) -> Array:
-        """Mean radiance ``(H*W, 3)`` of paths a pixel; a filter with negative lobes gives negative values."""
-        # Other filters are in the places of the samples, which is as good and faster.
-        even = not self._exact and self.film.filter == "mitchell"
-        kind = {"exact": self._exact, "stratified": stratified, "even": even}
-        return self.pixels(self.trace(frame, paths, seed, features=False, **kind))
 
     def frame(self, frame: int, paths: int, seed: Sequence[int]) -> dict[str, Array]:
         """Color and features of the same independent samples, by buffer names, ``(H*W, C)``."""
-        return self._buffers(frame, self.trace(frame, paths, seed, exact=self._exact, even=self.film.spreads))
+        return self._buffers(frame, self.trace(frame, paths, seed, even=self.film.spreads))
 
     def features(self, frame: int) -> dict[str, Array]:
         """Features at the pixel centres, by buffer names, ``(H*W, C)``."""
@@ -66,10 +59,10 @@ class SequenceTracer(Tracer):
         """Buffers; the background is at a distance behind everything, and has neither normal nor albedo."""
         pixels = self.pixels(samples)
         position, eye = pixels[:, REST : REST + 3], self._cameras[frame].to_world
-        # A filter with negative lobes may exceed the range of its input; a few BSDFs' albedo exceeds 1.
+        # Rounding makes some unit normals longer than 1; a few BSDFs' albedo exceeds 1.
         length = np.linalg.norm(pixels[:, NORMAL], axis=1, keepdims=True)
         found = {
-            "color": np.maximum(pixels[:, COLOR], 0),
+            "color": pixels[:, COLOR],
             "albedo": np.clip(pixels[:, ALBEDO], 0, 1),
             "normal": pixels[:, NORMAL] / np.maximum(length, 1),
             "position": position,
@@ -99,7 +92,7 @@ class SequenceTracer(Tracer):
     def _rest(self, ray: Any, hit: Any, valid: Any, shot: Any) -> list[Any]:
         """Position, and where the point was in the previous frame if anything moves."""
         mi, dr = self._mi, self._dr
-        far = ray.o + (self._reach if self._scalar else dr.opaque(mi.Float, self._reach)) * ray.d
+        far = ray.o + (self.reach if self._scalar else dr.opaque(mi.Float, self.reach)) * ray.d
         if self._scalar and not valid:
             return [*far, *(far if self._stage.moves else [])]
         positions = [hit.p, self._earlier(hit, shot)] if self._stage.moves else [hit.p]

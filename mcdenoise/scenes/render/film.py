@@ -14,7 +14,7 @@ from mcdenoise.errors import InputError
 
 _SIZE = 4096
 # Largest distance of a sample from the pixel's centre, in pixels.
-_RADII = {"centre": 0.0, "box": 0.5, "tent": 1.0, "gaussian": 2.0, "blackman_harris": 0.75, "mitchell": 2.0}
+_RADII = {"centre": 0.0, "box": 0.5, "tent": 1.0, "gaussian": 2.0, "blackman_harris": 0.75}
 FILTERS = tuple(_RADII)
 
 
@@ -24,8 +24,7 @@ class Film:
 
     Args:
         filter: one of ``FILTERS``: all samples at the centre, a box of one pixel, a tent of radius 1, a Gaussian of
-            deviation 0.5, Blackman-Harris over 1.5 pixels as in Cycles, or Mitchell and Netravali's with both
-            parameters 1/3.
+            deviation 0.5, or Blackman-Harris over 1.5 pixels as in Cycles.
         aperture: radius of the lens, scene units; 0 is a pinhole.
         focus: distance along the viewing axis at which a lens is sharp, scene units.
         splat: whether a sample goes to all pixels that the filter reaches, as in Mitsuba, or to its own, as in Cycles.
@@ -50,8 +49,7 @@ class Film:
     @property
     def spreads(self) -> bool:
         """Whether samples go to several pixels."""
-        # Places cannot be drawn by negative weights.
-        return self.filter == "mitchell" or (self.splat and _RADII[self.filter] > 0.5)
+        return self.splat and _RADII[self.filter] > 0.5
 
 
 def curve(name: str, x: NDArray[Any]) -> Array:
@@ -63,9 +61,6 @@ def curve(name: str, x: NDArray[Any]) -> Array:
         return np.asarray(np.maximum(1 - r, 0))
     if name == "gaussian":
         return np.asarray(np.maximum(np.exp(-2 * r**2) - np.exp(-8.0), 0))
-    if name == "mitchell":
-        near, far = 7 * r**3 - 12 * r**2 + 16 / 3, -7 / 3 * r**3 + 12 * r**2 - 20 * r + 32 / 3
-        return np.asarray(np.where(r < 1, near, np.where(r < 2, far, 0)) / 6)
     # Blackman-Harris, 1.5 pixels wide, as Cycles has it by default.
     t = np.pi * (r / 0.75)
     window = 0.35875 + 0.48829 * np.cos(t) + 0.14128 * np.cos(2 * t) + 0.01168 * np.cos(3 * t)
@@ -106,6 +101,5 @@ def splat(name: str, values: NDArray[Any], x: NDArray[Any], y: NDArray[Any], siz
                 at = slice(2 + down, 2 + down + height), slice(2 + right, 2 + right + width)
                 total[at] += np.einsum("ps,psc->pc", weight, values).reshape(height, width, channels)
                 weights[at] += weight.sum(1).reshape(height, width, 1)
-    # Weights of a filter with negative lobes may cancel.
-    image = total / np.where(weights < 0, np.minimum(weights, -1e-9), np.maximum(weights, 1e-9))
+    image = total / np.maximum(weights, 1e-9)
     return np.asarray(image[2:-2, 2:-2].reshape(pixels, channels))

@@ -14,7 +14,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Array, Camera, view_projection
 from mcdenoise.data.exr import read_exr
-from mcdenoise.data.files import write_json
+from mcdenoise.data.files import make_folder, write_json
 from mcdenoise.data.images import read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
 from mcdenoise.errors import InputError
@@ -96,38 +96,66 @@ class ReferenceState:
 
 
 class SequenceFolder:
-    """The folder ``out/inputs`` with its camera files.
+    """The folder ``out/inputs`` with its camera files, ``camera.json`` among them.
 
     Args:
         out: folder of the sequence; created if it does not exist.
-        settings: contents of ``camera.json``, see :func:`describe`. ``reference_spp`` and ``reference_noise`` are added
-            here, for the references on disk.
+        scene: what is rendered.
+        cameras: one a frame.
+        size: width and height in pixels.
+        planes: distances of the near and the far plane.
+        moves: see :class:`mcdenoise.data.camera_path.CameraPath`; may be of more frames.
         conventions: how the renderer makes what the files hold.
+        settings: of the renderer. ``reference_spp`` and ``reference_noise`` are added here, for the references on disk.
 
     Raises:
         InputError: the folder cannot be created, or was rendered with other settings.
     """
 
-    def __init__(self, out: Path, settings: dict[str, Any], conventions: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        out: Path,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        size: tuple[int, int],
+        planes: tuple[float, float],
+        moves: Mapping[str, Array],
+        conventions: Mapping[str, Any],
+        **settings: Any,
+    ) -> None:
         self.path = out / "inputs"
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be created ({error.strerror}); choose another output folder"
-            ) from error
+        make_folder(self.path)
         self._description = self.path / "camera.json"
-        before = self._read(settings) if self._description.is_file() else {}
-        self._settings = {**_merged(before, settings), **_ALWAYS, **conventions}
-        self.references = self._find_references(before.get("reference_spp", {}))
+        matrices = np.stack([view_projection(camera, *size, *planes) for camera in cameras])
+        moved = {name: path[: len(cameras)].tolist() for name, path in moves.items()}
+        described = {
+            "scene": scene_name(scene),
+            "scene_sha256": scene_digest(scene),
+            "frames": len(cameras),
+            "width": size[0],
+            "height": size[1],
+            "fov_x_degrees": cameras[0].fov_x,
+            "near": planes[0],
+            "far": planes[1],
+            "normal_limit_squared": 1.0,
+            "pixel_offsets": [[0.5, 0.5]] * len(cameras),
+            "camera_matrices": matrices.tolist(),
+            "world_to_clip": matrices.transpose(0, 2, 1).tolist(),
+            "camera_to_world": [camera.to_world.tolist() for camera in cameras],
+            **({"moves": moved} if moved else {}),
+            **settings,
+        }
+        before = self._read(described) if self._description.is_file() else {}
+        self._settings = {**_merged(before, described), **_ALWAYS, **conventions}
+        self.references = self._find_references()
         self._write()
-        matrices = CameraMatrices(
+        header = CameraMatrices(
             np.array(self._settings["camera_matrices"]),
             np.array(self._settings["pixel_offsets"]),
             self._settings["position_limit_squared"],
             self._settings["normal_limit_squared"],
         )
-        write_camera_matrices(self.path / "camera_matrices.h", matrices, _ALWAYS["conventions"]["camera_matrices"])
+        write_camera_matrices(self.path / "camera_matrices.h", header, _ALWAYS["conventions"]["camera_matrices"])
 
     def note_reference(self, number: int, state: ReferenceState | None) -> None:
         """Record the progress of a reference, if there is any, in ``camera.json``.
@@ -146,7 +174,6 @@ class SequenceFolder:
             moves = {identity: list(path) for identity, path in before.get("moves", {}).items()}
             common = min(int(before["frames"]), settings["frames"])
             paths = {key: [before[key][number] for number in range(common)] for key in _POSES}
-            before["reference_spp"] = dict(before.get("reference_spp", {}))
         except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
@@ -167,7 +194,7 @@ class SequenceFolder:
                     )
         return before
 
-    def _find_references(self, known_spp: Mapping[str, int]) -> dict[int, ReferenceState]:
+    def _find_references(self) -> dict[int, ReferenceState]:
         """Read the states of references from their headers, which are written together with the pixels."""
         found: dict[int, ReferenceState] = {}
         for number in range(self._settings["frames"]):
@@ -177,9 +204,6 @@ class SequenceFolder:
                 continue
             header = read_image_header(path).metadata
             spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
-            if spp is None:
-                # Older versions wrote no number of passes: there cannot be more passes than paths.
-                spp = passes = known_spp.get(str(number))
             if not isinstance(spp, int) or not isinstance(passes, int):
                 raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
             found[number] = ReferenceState(spp, passes, noise if isinstance(noise, float) else None)
@@ -191,45 +215,6 @@ class SequenceFolder:
         noise = {str(number): state.noise for number, state in states}
         content = {**self._settings, "reference_spp": spp, "reference_noise": noise}
         write_json(self._description, content)
-
-
-def describe(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    size: tuple[int, int],
-    planes: tuple[float, float],
-    moves: Mapping[str, Array],
-    **settings: Any,
-) -> dict[str, Any]:
-    """Contents of ``camera.json``: scene, cameras and moves, and the settings of a renderer.
-
-    Args:
-        scene: what is rendered.
-        cameras: one a frame.
-        size: width and height in pixels.
-        planes: distances of the near and the far plane.
-        moves: see :class:`mcdenoise.data.camera_path.CameraPath`; may be of more frames.
-        settings: further entries.
-    """
-    matrices = np.stack([view_projection(camera, *size, *planes) for camera in cameras])
-    moved = {name: path[: len(cameras)].tolist() for name, path in moves.items()}
-    return {
-        "scene": scene_name(scene),
-        "scene_sha256": scene_digest(scene),
-        "frames": len(cameras),
-        "width": size[0],
-        "height": size[1],
-        "fov_x_degrees": cameras[0].fov_x,
-        "near": planes[0],
-        "far": planes[1],
-        "normal_limit_squared": 1.0,
-        "pixel_offsets": [[0.5, 0.5]] * len(cameras),
-        "camera_matrices": matrices.tolist(),
-        "world_to_clip": matrices.transpose(0, 2, 1).tolist(),
-        "camera_to_world": [camera.to_world.tolist() for camera in cameras],
-        **({"moves": moved} if moved else {}),
-        **settings,
-    }
 
 
 def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceState) -> None:
@@ -271,16 +256,13 @@ def write_noisy(folder: Path, number: int, noise_seed: int, buffers: Mapping[str
         InputError: a file cannot be written.
     """
     place = noise_seed_folder(folder, noise_seed)
-    try:
-        place.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{place}: cannot be created ({error.strerror}); choose another output folder") from error
+    make_folder(place)
     for name, buffer in buffers.items():
         write_buffer(place, number, name, buffer)
 
 
 def _merged(before: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:
     """Merge descriptions, so that rendering fewer frames or noise seeds than before keeps the others."""
-    longer = {key: before[key] for key in _PER_FRAME if key in before} if before else {}
-    kept = longer if before and before["frames"] > settings["frames"] else {}
+    longer = before.get("frames", 0) > settings["frames"]
+    kept = {key: before[key] for key in _PER_FRAME if key in before} if longer else {}
     return {**settings, **kept, "noise_seeds": max(settings["noise_seeds"], before.get("noise_seeds", 1))}

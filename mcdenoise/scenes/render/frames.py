@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.files import as_tensor
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
@@ -36,29 +37,30 @@ class FrameJob:
     """Settings common to all frames, those of :func:`mcdenoise.scenes.render.render_sequence`, and the state on disk.
 
     Args:
+        cameras: also of frames that are not rendered.
         folder: ``inputs`` of the sequence.
-        reach: distance of the background in scene units.
+        frames: how many are rendered.
         references: frames that get a reference.
         started: progress of the references on disk.
     """
 
     scene: Scene
     variant: str
+    moves: dict[str, Array]
+    cameras: list[Camera]
+    size: tuple[int, int]
+    film: Film | None
     max_depth: int
     folder: Path
-    cameras: list[Camera]
-    moves: dict[str, Array]
-    size: tuple[int, int]
-    reach: float
+    frames: int
     spp: int
     noise_seeds: int
     reference_spp: int
     noise_level: float | None
     references: frozenset[int]
-    started: dict[int, ReferenceState] = field(default_factory=dict)
     seed: int
-    film: Film | None = None
-    keep_samples: bool = False
+    keep_samples: bool
+    started: dict[int, ReferenceState]
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -95,7 +97,7 @@ class FrameJob:
 
     def paths_there(self) -> int:
         """Number of paths per pixel that are already on disk, summed over all frames."""
-        colors = sum(self.has(n, k, ("color",)) for n in range(len(self.cameras)) for k in range(self.noise_seeds))
+        colors = sum(self.has(n, k, ("color",)) for n in range(self.frames) for k in range(self.noise_seeds))
         states = [(number, self.started[number]) for number in self.references if number in self.started]
         return colors * self.spp + sum(
             state.spp if self.wants_reference(number) else self.reference_spp for number, state in states
@@ -107,7 +109,7 @@ def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:
     if job.folder not in _loaded:
         _loaded.clear()
         stage = Stage(job.scene, job.variant, job.moves)
-        _loaded[job.folder] = SequenceTracer(stage, job.cameras, job.size, job.film, job.max_depth, job.reach)
+        _loaded[job.folder] = SequenceTracer(stage, job.cameras, job.size, job.film, job.max_depth)
     return render_frame(job, _loaded[job.folder], number, lambda paths: None)
 
 
@@ -192,14 +194,14 @@ def _refine_reference(
         rest = missing if halves.passes else (missing + 1) // 2
         paths = STRATIFIED_PATHS if stratified else rest
         seed = (job.seed, number, 1, halves.passes)
-        halves.add(tracer.radiance(number, paths, seed, stratified), paths)
+        halves.add(tracer.radiance(number, paths, seed, stratified=stratified), paths)
         advance(paths)
         if time.monotonic() - saved > _SECONDS_BETWEEN_SAVES:
             halves.save(unfinished)
             saved = time.monotonic()
     advance(max(0, job.reference_spp - halves.spp))
     state = ReferenceState(halves.spp, halves.passes, halves.noise())
-    write_reference(job.folder, number, _image(np.maximum(halves.mean(), 0), job.size), state)
+    write_reference(job.folder, number, _image(halves.mean(), job.size), state)
     unfinished.unlink(missing_ok=True)
     return state
 
@@ -211,4 +213,4 @@ def _reliable_noise(halves: ReferenceHalves) -> float | None:
 
 def _image(values: Array, size: tuple[int, int]) -> torch.Tensor:
     width, height = size
-    return torch.from_numpy(values.reshape(height, width, -1).astype(np.float32)).permute(2, 0, 1)[None]
+    return as_tensor(values.reshape(height, width, -1))

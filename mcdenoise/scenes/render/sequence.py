@@ -19,7 +19,7 @@ from mcdenoise.engines import Engine, LocalEngine, run_each
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.features import RR_DEPTH, STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder, describe
+from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame, render_frame_task
 from mcdenoise.scenes.render.loading import Scene, choose_variant
 from mcdenoise.scenes.render.stage import Stage
@@ -102,14 +102,8 @@ def render_sequence(
     count = len(cameras) if frames is None else min(frames, len(cameras))
     references = frozenset(range(count) if reference_frames is None else reference_frames)
     _check_settings(size, count, references, noise_level)
-    check_lowest(
-        spp=(spp, 1),
-        noise_seeds=(noise_seeds, 1),
-        reference_spp=(reference_spp, 1),
-        seed=(seed, 0),
-        max_depth=(max_depth, 1),
-        workers=(workers, 1),
-    )
+    check_lowest(1, spp=spp, noise_seeds=noise_seeds, reference_spp=reference_spp, max_depth=max_depth, workers=workers)
+    check_lowest(0, seed=seed)
     variant = choose_variant(variant)
     if workers > 1 and engine is None:
         engine = LocalEngine(workers)
@@ -120,21 +114,19 @@ def render_sequence(
             raise InputError(
                 f"scene dictionary: expected plain Python and numpy for more than one worker, found {error}"
             ) from error
-    stage = Stage(scene, variant, checked_moves)
-    reach = stage.reach(cameras)
-    tracer = SequenceTracer(stage, cameras, size, film, max_depth, reach)
+    tracer = SequenceTracer(Stage(scene, variant, checked_moves), cameras, size, film, max_depth)
     tracer.place(0)
     away = tracer.features(0)["position"] - cameras[0].to_world[:3, 3]
     scale = float(np.median(np.linalg.norm(away, axis=1)))
-    near, far = 0.01 * scale, 2 * reach
-    cameras = cameras[:count]
-    settings = describe(
+    folder = SequenceFolder(
+        Path(out),
         scene,
-        cameras,
+        cameras[:count],
         size,
-        (near, far),
+        (0.01 * scale, 2 * tracer.reach),
         checked_moves,
-        renderer=stage.name,
+        BY_MITSUBA | (ON_A_FILM if film is not None else {}),
+        renderer=tracer.name,
         noisy_spp=spp,
         film=None if film is None else asdict(film),
         # Omitted if unused, as in folders of versions without this setting.
@@ -144,28 +136,27 @@ def render_sequence(
         rr_depth=RR_DEPTH,
         seed=seed,
         reference_sampling=f"passes of {STRATIFIED_PATHS} multi-jittered paths, a smaller rest of independent ones",
-        background=f"no hit: albedo and normal are 0, world_position is {reach:g} units along the ray",
+        background=f"no hit: albedo and normal are 0, world_position is {tracer.reach:g} units along the ray",
         position_limit_squared=(0.02 * scale) ** 2,
     )
-    folder = SequenceFolder(Path(out), settings, BY_MITSUBA | (ON_A_FILM if film is not None else {}))
     job = FrameJob(
         scene=scene,
         variant=variant,
+        moves=checked_moves,
+        cameras=cameras,
+        size=size,
+        film=film,
         max_depth=max_depth,
         folder=folder.path,
-        cameras=cameras,
-        moves=checked_moves,
-        size=size,
-        reach=reach,
+        frames=count,
         spp=spp,
         noise_seeds=noise_seeds,
         reference_spp=reference_spp,
         noise_level=noise_level,
         references=references,
-        started=dict(folder.references),
         seed=seed,
-        film=film,
         keep_samples=keep_samples,
+        started=dict(folder.references),
     )
 
     done, total = 0, count * noise_seeds * spp + len(references) * reference_spp
@@ -210,8 +201,8 @@ def _check_settings(size: tuple[int, int], count: int, references: frozenset[int
         raise InputError(f"noise_level: expected more than 0 and less than 1, found {noise_level:g}")
 
 
-def check_lowest(**settings: tuple[int, int]) -> None:
-    """Check that each setting has at least a value; they are pairs of both."""
-    for name, (value, lowest) in settings.items():
+def check_lowest(lowest: int, **settings: int) -> None:
+    """Check that each setting has at least a value."""
+    for name, value in settings.items():
         if value < lowest:
             raise InputError(f"{name}: expected at least {lowest}, found {value}")

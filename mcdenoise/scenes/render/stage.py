@@ -111,6 +111,11 @@ class Stage:
         return placement
 
 
+def to_previous(path: Array, frame: int) -> Array:
+    """``(4, 4)``, from where an object is in a frame to where it was in the previous one; the identity at first."""
+    return np.asarray(path[max(frame - 1, 0)] @ np.linalg.inv(path[frame]))
+
+
 def _box(shape: Any) -> Array:
     """Corners ``(8, 3)`` of a shape's bounding box."""
     box = shape.bbox()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.render.film import Film, offsets, splat
-from mcdenoise.scenes.render.stage import Stage
+from mcdenoise.scenes.render.stage import Stage, to_previous
 
 # Samples traced at once: enough to fill the vector units, small enough for a laptop's memory.
 WAVEFRONT = 2**22
@@ -71,6 +71,8 @@ class Tracer:
     lamps: float | None = None
     # Whether color is black where nothing is hit.
     void = False
+    # Whether all rays go through pixel centres, and a pinhole.
+    exact = False
 
     def __init__(
         self,
@@ -83,7 +85,7 @@ class Tracer:
         looks: Mapping[str, Sequence[float]] | None = None,
         layers: int = 0,
     ) -> None:
-        self._stage, self._cameras, self.size, self.film = stage, cameras, size, film
+        self._stage, self._cameras, self.size, self.film, self.name = stage, cameras, size, film, stage.name
         self._mi, self._dr, self._scalar, self._layers = stage.mitsuba, stage.drjit, stage.scalar, layers
         self._path = self._mi.load_dict({"type": "path", "max_depth": depths[0], "rr_depth": depths[1]})
         self._table, self._index = self._shapes(looks)
@@ -113,7 +115,7 @@ class Tracer:
             seed: another one gives independent noise.
             color: whether radiance is wanted; else it is 0.
             features: whether the other channels are wanted.
-            exact: whether all rays go through the pixel's centre, and a pinhole.
+            exact: whether all rays go through the pixel's centre, and a pinhole, whatever the film.
             stratified: stratify the samples of each pixel (correlated multi-jittered sampling) instead of sampling
                 independently. The expectation is the same, and the error usually smaller.
             even: let samples lie evenly in the pixel, to be weighed by :meth:`pixels`; else the filter's weight is in
@@ -121,7 +123,7 @@ class Tracer:
         """
         width, height = self.size
         now, before = (self._lens(self._cameras[number]) for number in (frame, max(frame - 1, 0)))
-        shot = _Shot(now, before, self._movements(frame), spp, color, features, exact, stratified, even)
+        shot = _Shot(now, before, self._movements(frame), spp, color, features, exact or self.exact, stratified, even)
         parts = []
         rows = height if self._scalar else max(1, min(height, WAVEFRONT // (width * spp)))
         for top in range(0, height, rows):
@@ -142,6 +144,10 @@ class Tracer:
             x, y = samples.places
             return splat(self.film.filter, samples.values, x, y, self.size)
         return np.asarray(samples.values.mean(1, dtype=np.float64))
+
+    def radiance(self, frame: int, spp: int, seed: Sequence[int], *, stratified: bool = False) -> Array:
+        """``(H*W, 3)`` means of the color of samples; see :meth:`trace`."""
+        return self.pixels(self.trace(frame, spp, seed, features=self.void, stratified=stratified))[:, COLOR]
 
     def _rows(self, shot: _Shot, state: int, top: int, rows: int) -> NDArray[np.float32]:
         """Channels, and places if they are to be weighed, ``(rows * W * spp, C)``."""
@@ -242,29 +248,20 @@ class Tracer:
         """Where a point that is hit was in the previous frame."""
         if shot.moved is None:
             return hit.p
-        mi, dr = self._mi, self._dr
-        index = self._row(hit)[4]
-        if self._scalar:
-            start = 12 * max(int(index), 0)
-            rows = [[float(shot.moved[start + 4 * i + j]) for j in range(4)] for i in range(3)]
-        else:
-            start = mi.UInt32(dr.maximum(index, 0)) * 12
-            rows = [[dr.gather(mi.Float, shot.moved, start + (4 * i + j)) for j in range(4)] for i in range(3)]
+        mi, index = self._mi, self._row(hit)[4]
+        start = mi.UInt32(self._dr.maximum(index, 0)) * 12
+        m = [self._at(shot.moved, start + k) for k in range(12)]
         x, y, z = hit.p.x, hit.p.y, hit.p.z
-        turned = mi.Point3f(*(m[0] * x + m[1] * y + m[2] * z + m[3] for m in rows))
-        return dr.select(index >= 0, turned, hit.p)
+        turned = mi.Point3f(*(m[k] * x + m[k + 1] * y + m[k + 2] * z + m[k + 3] for k in (0, 4, 8)))
+        return self._dr.select(index >= 0, turned, hit.p)
 
     def _shift(self, u: Any) -> Any:
         """The place of a sample by the filter, from the pixel's centre."""
-        dr, last = self._dr, len(self._offsets) - 1
+        last = len(self._offsets) - 1
         position = u * last
-        if self._scalar:
-            low = min(int(position), last - 1)
-            return float(self._offsets[low] + (self._offsets[low + 1] - self._offsets[low]) * (position - low))
-        mi = self._mi
-        low = dr.minimum(mi.UInt32(position), last - 1)
-        first, second = (dr.gather(mi.Float, self._offsets, low + k) for k in range(2))
-        return first + (second - first) * (position - mi.Float(low))
+        low = self._dr.minimum(self._mi.UInt32(position), last - 1)
+        first, second = (self._at(self._offsets, low + k) for k in range(2))
+        return first + (second - first) * (position - self._mi.Float(low))
 
     def _lens(self, camera: Camera) -> list[Any]:
         """Axes, origin and half the width at distance 1, as values that are not part of the program."""
@@ -277,8 +274,7 @@ class Tracer:
         moves, movers = self._stage.moves, self._stage.movers
         if not movers:
             return None
-        earlier = max(frame - 1, 0)
-        rows = [(moves[name][earlier] @ np.linalg.inv(moves[name][frame]))[:3] for name in movers]
+        rows = [to_previous(moves[name], frame)[:3] for name in movers]
         return self._float_table(np.concatenate([*rows, np.zeros((3, 4))]).ravel())
 
     def _shapes(self, looks: Mapping[str, Sequence[float]] | None) -> tuple[Any, dict[str, int]]:
@@ -300,11 +296,15 @@ class Tracer:
     def _row(self, hit: Any) -> list[Any]:
         mi, dr = self._mi, self._dr
         if self._scalar:
-            start = _COLUMNS * self._index.get((hit.instance or hit.shape).id(), 0)
-            return [float(self._table[start + k]) for k in range(_COLUMNS)]
-        whole = dr.reinterpret_array(mi.UInt32, hit.instance)
-        start = dr.select(whole > 0, whole, dr.reinterpret_array(mi.UInt32, hit.shape)) * _COLUMNS
-        return [dr.gather(mi.Float, self._table, start + k, hit.is_valid()) for k in range(_COLUMNS)]
+            row: Any = self._index.get((hit.instance or hit.shape).id(), 0)
+        else:
+            whole = dr.reinterpret_array(mi.UInt32, hit.instance)
+            row = dr.select(whole > 0, whole, dr.reinterpret_array(mi.UInt32, hit.shape))
+        return [self._at(self._table, row * _COLUMNS + k, hit.is_valid()) for k in range(_COLUMNS)]
+
+    def _at(self, table: Any, place: Any, active: Any = True) -> Any:
+        """A number of a table."""
+        return float(table[place]) if self._scalar else self._dr.gather(self._mi.Float, table, place, active)
 
     def _float_table(self, values: Array) -> Any:
         return values if self._scalar else self._mi.Float(np.ascontiguousarray(values, dtype=np.float32))

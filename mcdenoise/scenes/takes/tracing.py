@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
+from mcdenoise.scenes.random.materials import METALS
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.stage import Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, DEPTH, HIT, NORMAL, REST, Samples, Tracer
 from mcdenoise.scenes.takes.draw import Take
-from mcdenoise.scenes.takes.looks import look_of
 
 _DEPTHS = 8, 3
 # Samples of each half of a reference: 11 x 12 strata.
@@ -45,7 +46,6 @@ class TakeTracer(Tracer):
         stage = Stage(take.scene, variant, take.moves, merge=False)
         if threads:
             stage.drjit.set_thread_count(threads)
-        self.name = stage.name
         masked = any(isinstance(e, Mapping) and e.get("type") == "mask" for e in take.scene.values())
         film = Film(take.filter, take.aperture, take.focus, take.splat)
         layers = _LAYERS if masked else 0
@@ -79,7 +79,8 @@ class TakeTracer(Tracer):
         """Two independent halves of the reference of a frame, ``(3, H, W)`` each."""
         width, height = self.take.size
         seeds = ((self.take.number, frame, part) for part in (1, 2))
-        first, second = (self._mean_color(frame, seed).T.reshape(3, height, width) for seed in seeds)
+        both = (self.radiance(frame, self.half, seed, stratified=True) for seed in seeds)
+        first, second = (color.T.reshape(3, height, width) for color in both)
         return first, second
 
     def noise(self, frame: int) -> float:
@@ -98,11 +99,7 @@ class TakeTracer(Tracer):
 
     def _scattered(self, frame: int, spp: int, part: int, *, color: bool = True) -> Samples:
         """Samples as the take's film has them."""
-        return self.trace(frame, spp, (self.take.number, frame, part), color=color, even=self.film.splat)
-
-    def _mean_color(self, frame: int, seed: tuple[int, ...]) -> Array:
-        samples = self.trace(frame, self.half, seed, features=self.void, stratified=True)
-        return np.asarray(samples.values[..., COLOR].mean(1, dtype=np.float64))
+        return self.trace(frame, spp, (self.take.number, frame, part), color=color, even=self.film.spreads)
 
     def _glossy(self, hit: Any, bsdf: Any, diffuse: Any) -> Any:
         return self._mi.Color3f(*self._row(hit)[1:4])
@@ -129,12 +126,20 @@ class TakeTracer(Tracer):
 
 
 def _looks(take: Take) -> dict[str, tuple[float, ...]]:
-    """Roughness, and albedo without diffuse reflection, of each shape."""
-    materials = {name: look_of(entry) for name, entry in take.scene.items() if name.startswith("material_")}
+    """Roughness, and albedo without diffuse reflection, of each shape, as renderers write them."""
     looks: dict[str, tuple[float, ...]] = {}
     for name, entry in take.scene.items():
-        look = materials.get(entry.get("bsdf", {}).get("id", "")) if isinstance(entry, Mapping) else None
-        if look is not None:
-            color = {"black": (0, 0, 0), "white": (1, 1, 1), "color": look.color}[take.glossy]
-            looks[name] = (look.roughness, *color)
+        material = take.scene.get(entry.get("bsdf", {}).get("id", "")) if isinstance(entry, Mapping) else None
+        if material is not None:
+            while "bsdf" in material:
+                material = material["bsdf"]
+            color = {"black": (0, 0, 0), "white": (1, 1, 1), "color": METALS.get(material.get("material"), (1, 1, 1))}
+            looks[name] = (_roughness(material), *color[take.glossy])
     return looks
+
+
+def _roughness(bsdf: Mapping[str, Any]) -> float:
+    """Perceptual roughness, the root of Beckmann's parameter."""
+    alpha = bsdf.get("alpha", float(bsdf["type"] == "diffuse"))
+    mean = float(np.mean(alpha["bitmap"] if isinstance(alpha, Mapping) else alpha))
+    return math.sqrt(min(max(mean, 0.0), 1.0))
