@@ -30,6 +30,7 @@ from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, buffers_of
 from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
 from mcdenoise.scenes.random.builder import place, rgb, rotate
+from mcdenoise.scenes.render import Film
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 PYTHON = os.environ.get(PYTHON_VARIABLE)
@@ -40,7 +41,7 @@ CAMERA = Camera.look_at((0, 0, 4), (0, 0, 0), fov_x=40)
 def take_of(scene: dict[str, Any], cameras: list[Camera], **changed: Any) -> Take:
     """A take of a scene, sampled at pixel centres through a pinhole."""
     drawn = draw_take(0, Assets(), frames=1, stills=False)
-    plain = replace(drawn, scene=scene, cameras=cameras, moves={}, filter="centre", aperture=0.0)
+    plain = replace(drawn, scene=scene, cameras=cameras, moves={}, film=Film("centre"))
     return replace(plain, **changed)
 
 
@@ -403,7 +404,7 @@ def pixels(folder: Path) -> dict[str, Any]:
 def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Path) -> None:
     drawn = draw_take(4, Assets(), frames=2, stills=False)
     assert drawn.moves.keys() - {"sky"}
-    made = replace(drawn, filter="gaussian", aperture=0.0)
+    made = replace(drawn, film=Film("gaussian"))
     options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 8, "seed": 5}
     options |= {"samples": 2, "shutter": 0.0}
     seen: list[tuple[int, int]] = []
@@ -436,7 +437,7 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     scene = scene_of(wall=wall, bar=bar, sky={"type": "constant", "radiance": 1.0})
     spread = []
     for aperture in (0.0, 1.0):
-        take = take_of(scene, [CAMERA], aperture=aperture, focus=24.0)
+        take = take_of(scene, [CAMERA], film=Film("centre", aperture, focus=24.0))
         options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 0, "shutter": 0.0}
         frame = open_sequence(render_cycles(take, tmp_path / f"{aperture}", blender, **options)).frame(0)
         near = image(frame.depth)[..., 0] < 10

@@ -85,11 +85,12 @@ def generate(
     else:
         arguments |= {"variant": variant}
         plan = SequencePlan(**common, frames=frames, rendering=arguments, cycles=renderer == "cycles", parts=parts)
-    if workers is None:
-        gpus = float(str(variant).startswith("cuda"))
-        return _on_ray(plan, chosen, RayEngine(rendering.workers, cpus=plan.threads, gpus=gpus), out)
     with progress_bar() as progress:
         scenes = progress.add_task("takes" if takes else "scenes", total=len(chosen))
+
+        def finish(call: tuple[Plan, int], written: Path) -> None:
+            progress.advance(scenes)
+            say(out / written.relative_to(call[0].out))
 
         def begin(name: str) -> Callable[[int, int], None]:
             task = progress.add_task(name, total=None)
@@ -99,11 +100,14 @@ def generate(
 
             return show
 
-        for seed in chosen:
-            written = plan.render(seed, None if takes else begin(f"scene {seed}"))
-            say(out / written.relative_to(plan.out))
-            progress.advance(scenes)
-    return None
+        if workers is not None:
+            for seed in chosen:
+                finish((plan, seed), plan.render(seed, None if takes else begin(f"scene {seed}")))
+            return None
+        engine = RayEngine(rendering.workers, cpus=plan.threads, gpus=float(str(variant).startswith("cuda")))
+        failed = run_each(engine, render_seed, [(plan, seed) for seed in chosen], finish)
+    print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
+    return 1 if failed else None
 
 
 def _opened(folder: str | None) -> Assets:
@@ -125,20 +129,6 @@ def _of_takes(rendering: RenderOptions, frames: int) -> dict[str, Any]:
         **({"size": parse_size(rendering.size)} if "size" in given else {}),
         **({"half": rendering.reference_spp // 2} if "reference_spp" in given else {}),
     }
-
-
-def _on_ray(plan: Plan, seeds: list[int], engine: RayEngine, out: Path) -> int | None:
-    """Render the seeds on a Ray cluster, a task each."""
-    with progress_bar() as progress:
-        scenes = progress.add_task("scenes", total=len(seeds))
-
-        def finish(call: tuple[Plan, int], written: Path) -> None:
-            progress.advance(scenes)
-            say(out / written.relative_to(call[0].out))
-
-        failed = run_each(engine, render_seed, [(plan, seed) for seed in seeds], finish)
-    print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
-    return 1 if failed else None
 
 
 def render_seed(plan: Plan, seed: int) -> Path:

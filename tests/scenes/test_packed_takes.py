@@ -15,7 +15,7 @@ from mcdenoise.data.camera_path import Camera
 from mcdenoise.data.shards import find_shards, open_shard
 from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.random.materials import diffuse, glass
-from mcdenoise.scenes.render.film import curve, offsets, splat
+from mcdenoise.scenes.render.film import Film, curve, offsets, splat
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 NOTHING = Assets()
@@ -26,9 +26,9 @@ FOV = 50.0
 def test_numbers_draw_stills_clips_and_every_kind_of_sampling() -> None:
     takes = [draw_take(number, NOTHING, size=SIZE) for number in range(14)]
     assert {len(take.cameras) for take in takes} == {1, 16}
-    assert len({take.filter for take in takes}) >= 4
+    assert len({take.film.filter for take in takes}) >= 4
     assert {take.features for take in takes} == {"noisy", "exact", "clean"}
-    assert all(take.aperture == 0 for take in takes if take.filter == "centre")
+    assert all(take.film.aperture == 0 for take in takes if take.film.filter == "centre")
 
 
 @pytest.mark.parametrize(("name", "variance"), [("centre", 0), ("box", 1 / 12), ("tent", 1 / 6)])
@@ -72,10 +72,7 @@ def known(**changed: Any) -> Take:
         void=False,
         size=SIZE,
         spp=4,
-        filter="box",
-        splat=False,
-        aperture=0.0,
-        focus=2.0,
+        film=Film("box", splat=False),
         features="noisy",
         glossy="white",
         white_lamps=True,
@@ -99,7 +96,7 @@ SHIFT = 0.1 / (2 * math.tan(math.radians(FOV / 2))) * SIZE[0] / 2
 
 @pytest.mark.parametrize("splatted", [False, True])
 def test_frames_of_a_known_scene_are_known(splatted: bool) -> None:
-    frame, halves = traced(known(splat=splatted, filter="tent"))
+    frame, halves = traced(known(film=Film("tent", splat=splatted)))
     for name, value in {"albedo": 0.5, "depth": 2.0, "alpha": 1.0, "roughness": 1.0}.items():
         assert np.allclose(frame[name], value, atol=1e-4), name
     assert np.allclose(frame["normal"].reshape(3, -1).T, (0, 0, 1), atol=1e-5)
@@ -157,7 +154,7 @@ def test_references_have_the_filter_of_the_frames(void: bool, splatted: bool) ->
     wall["to_world"][0, 3] = -9
     scene = {"type": "scene", "material_0": diffuse((0.0, 0.0, 0.0)), "wall": wall}
     still = [Camera.look_at((0, 0, 0), (0, 0, -1), FOV)] * 2
-    take = known(scene=scene, cameras=still, void=void, splat=splatted, filter="gaussian", spp=36)
+    take = known(scene=scene, cameras=still, void=void, film=Film("gaussian", splat=splatted), spp=36)
     frame, halves = traced(take)
     inside = 0.5 * (1 + math.erf(1 / math.sqrt(2)))
     for image in (frame["color"], sum(halves) / 2):
@@ -166,8 +163,7 @@ def test_references_have_the_filter_of_the_frames(void: bool, splatted: bool) ->
 
 
 def test_exact_features_behind_a_lens_are_those_of_a_pinhole() -> None:
-    lens = {"aperture": 0.3, "focus": 1.0, "features": "exact"}
-    sharp, _ = traced(known(**lens))
+    sharp, _ = traced(known(film=Film("box", aperture=0.3, splat=False), features="exact"))
     assert np.allclose(sharp["motion"][0], SHIFT, atol=1e-4)
     assert np.allclose(sharp["depth"], 2, atol=1e-5)
 

@@ -110,8 +110,8 @@ def render_cycles(
     if shutter is None:
         blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
         shutter = _SHUTTER if blurred and count > 1 else 0.0
-    used = take.filter if take.filter in _WIDTHS else _DEFAULT_FILTER
-    settings = {"filter": used, "aperture": take.aperture, "focus": take.focus, "shutter": shutter}
+    used = take.film.filter if take.film.filter in _WIDTHS else _DEFAULT_FILTER
+    settings = {"filter": used, "aperture": take.film.aperture, "focus": take.film.focus, "shutter": shutter}
     clean_samples = max(reference_samples, _CLEANER * samples) if reference_samples else 0
     # The sky stands still in Cycles.
     moves = check_moves({name: path for name, path in take.moves.items() if name != "sky"}, count)

@@ -14,6 +14,7 @@ from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.random.builder import rotate
 from mcdenoise.scenes.random.cameras import shoot
 from mcdenoise.scenes.random.movements import distance, movements
+from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.takes.furnish import Stock
 from mcdenoise.scenes.takes.places import build
 
@@ -46,10 +47,7 @@ class Take:
         void: whether the background is transparent and black.
         size: width and height in pixels.
         spp: samples a pixel of the noisy frames.
-        filter: of the pixel: ``"centre"``, ``"box"``, ``"tent"``, ``"gaussian"`` or ``"blackman_harris"``.
-        splat: whether a sample goes to all pixels that the filter reaches, as in Mitsuba, or to its own, as in Cycles.
-        aperture: radius of the lens; 0 is a pinhole.
-        focus: distance at which the lens is sharp.
+        film: filter of the pixel, and lens.
         features: ``"noisy"`` by the samples of the color, ``"exact"`` by a ray through each pixel's centre without a
             lens, ``"clean"`` by further samples.
         glossy: albedo of glass, mirrors and metals: ``"black"``, ``"white"`` or their ``"color"``.
@@ -65,10 +63,7 @@ class Take:
     void: bool
     size: tuple[int, int]
     spp: int
-    filter: str
-    splat: bool
-    aperture: float
-    focus: float
+    film: Film
     features: str
     glossy: str
     white_lamps: bool
@@ -78,7 +73,7 @@ class Take:
     def settings(self) -> dict[str, Any]:
         """How it is sampled, for the header of its file."""
         names = ("spp", "filter", "splat", "aperture", "focus", "features", "glossy", "white_lamps", "void", "attempt")
-        return {name: getattr(self, name) for name in names}
+        return {name: {**vars(self), **vars(self.film)}[name] for name in names}
 
 
 def draw_take(
@@ -137,11 +132,13 @@ def draw_take(
         void=void,
         size=size,
         spp=_draw(rng, _SAMPLES),
-        filter=kind,
-        splat=bool(splat and kind in ("tent", "gaussian")),
-        # The plane of focus shows a point at distance z with a blur of 2 aperture |z - focus| / z.
-        aperture=blur * pixel if lens and kind != "centre" else 0.0,
-        focus=focus,
+        film=Film(
+            filter=kind,
+            # The plane of focus shows a point at distance z with a blur of 2 aperture |z - focus| / z.
+            aperture=blur * pixel if lens and kind != "centre" else 0.0,
+            focus=focus,
+            splat=bool(splat and kind in ("tent", "gaussian")),
+        ),
         features=_draw(rng, _FEATURES) if kind != "centre" else "exact",
         glossy=_draw(rng, _GLOSSY),
         white_lamps=bool(rng.random() < 0.5),
@@ -149,7 +146,7 @@ def draw_take(
     )
     if not plain:
         return take
-    return replace(take, spp=1, filter="centre", splat=False, features="exact", aperture=0.0)
+    return replace(take, spp=1, features="exact", film=Film("centre", focus=focus, splat=False))
 
 
 def _narrowed(fov: float, zoom: float) -> float:

@@ -10,7 +10,6 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.materials import METALS
-from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.stage import Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, DEPTH, HIT, NORMAL, REST, Samples, Tracer
 from mcdenoise.scenes.takes.draw import Take
@@ -47,15 +46,14 @@ class TakeTracer(Tracer):
         if threads:
             stage.drjit.set_thread_count(threads)
         masked = any(isinstance(e, Mapping) and e.get("type") == "mask" for e in take.scene.values())
-        film = Film(take.filter, take.aperture, take.focus, take.splat)
         layers = _LAYERS if masked else 0
-        super().__init__(stage, take.cameras, take.size, film, _DEPTHS, looks=_looks(take), layers=layers)
+        super().__init__(stage, take.cameras, take.size, take.film, _DEPTHS, looks=_looks(take), layers=layers)
 
     def noisy(self, frame: int) -> dict[str, Array]:
         """Color and features of a frame: ``(C, H, W)`` by name."""
         take = self.take
         pixels = self.pixels(self._scattered(frame, take.spp, 0))
-        if take.features == "exact" and (take.filter != "centre" or take.spp > 1):
+        if take.features == "exact" and (take.film.filter != "centre" or take.spp > 1):
             pixels[:, 3:] = self.pixels(self.trace(frame, 1, (0,), color=False, exact=True))[:, 3:]
         elif take.features == "clean":
             pixels[:, 3:] = self.pixels(self._scattered(frame, _CLEAN, 3, color=False))[:, 3:]
