@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +19,7 @@ _CLEARANCE = 0.12
 _TRIES = 150
 
 
-@dataclass(frozen=True)
-class _View:
+class _View(NamedTuple):
     origin: Array
     target: Array
     fov_x: float
@@ -33,8 +32,10 @@ def shoot(builder: SceneBuilder, rng: Rng, frames: int) -> list[Camera]:
     best: tuple[float, list[_View]] = (-1.0, [])
     for _ in range(_TRIES):
         start = _propose(builder, rng)
-        path = _way_to_move(start, rng) if moving else _stay
-        views = [path(start, frame) for frame in range(_HORIZON + 1)]
+        views = [start] * (_HORIZON + 1)
+        if moving:
+            path = _way_to_move(start, rng)
+            views = [path(frame) for frame in range(_HORIZON + 1)]
         score = 0.0
         if _is_free(builder, boxes, views):
             score = min(_score(boxes, views[frame]) for frame in (0, _HORIZON // 2, _HORIZON))
@@ -97,15 +98,14 @@ def _score(boxes: tuple[Array, Array], view: _View) -> float:
     )
 
 
-def _stay(view: _View, frame: int) -> _View:
-    return view
-
-
-def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
+def _way_to_move(view: _View, rng: Rng) -> Callable[[int], _View]:
     """A movement of 0.3 to 12 pixels per frame in an image 256 pixels wide."""
     speed = float(np.exp(rng.uniform(math.log(0.3), math.log(12))))
     angle = math.radians(view.fov_x) / 256 * speed
-    step = angle * float(np.linalg.norm(view.target - view.origin))
+    forward = view.target - view.origin
+    length = float(np.linalg.norm(forward))
+    left = np.cross((0.0, 1.0, 0.0), forward / length)
+    step = angle * length
     kind = rng.choice(["dolly", "forward", "orbit", "pan", "free"], p=[0.3, 0.2, 0.15, 0.15, 0.2])
     sign = float(rng.choice([-1, 1]))
     drift = rng.normal(0, 1, 3) * (1, 0.3, 1)
@@ -114,11 +114,8 @@ def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
     sway = rng.choice([0.0, rng.uniform(0.1, 1.5)], p=[0.5, 0.5]) * math.radians(view.fov_x) / 256
     waves, phases = rng.uniform(0.4, 2.2, (3, 2)), rng.uniform(0, 2 * math.pi, (3, 2))
 
-    def move(start: _View, frame: int) -> _View:
-        origin, target = start.origin, start.target
-        forward = target - origin
-        length = float(np.linalg.norm(forward))
-        left = np.cross((0.0, 1.0, 0.0), forward / length)
+    def move(frame: int) -> _View:
+        origin, target = view.origin, view.target
         shift = np.sin(waves * frame + phases).sum(axis=1) * sway * length
         if kind == "dolly":
             offset = sign * frame * step * left
@@ -133,7 +130,7 @@ def _way_to_move(view: _View, rng: Rng) -> Callable[[_View, int], _View]:
             target = origin + _turned(forward, sign * frame * angle)
         else:
             origin, target = origin + frame * drift, target + 0.3 * frame * np.roll(drift, 1)
-        return _View(origin, target + shift, start.fov_x)
+        return _View(origin, target + shift, view.fov_x)
 
     return move
 

@@ -14,22 +14,23 @@ from mcdenoise.data.camera_path import Array
 
 Color = tuple[float, float, float]
 Rng = np.random.Generator
+# How often paints are, and their least and largest saturation and value.
+_PAINTS = {
+    "neutral": (0.3, (0, 0.12), (0.25, 0.9)),
+    "pastel": (0.25, (0.1, 0.4), (0.4, 0.85)),
+    "saturated": (0.2, (0.6, 0.97), (0.25, 0.85)),
+    "dark": (0.1, (0, 0.7), (0.02, 0.12)),
+    "wood": (0.15, (0.4, 0.75), (0.12, 0.6)),
+}
 
 
 def random_color(rng: Rng) -> Color:
     """A reflectance: neutral, pastel, saturated, dark or bright."""
     hue = float(rng.random())
-    kind = rng.choice(["neutral", "pastel", "saturated", "dark", "wood"], p=[0.3, 0.25, 0.2, 0.1, 0.15])
-    if kind == "neutral":
-        saturation, value = rng.uniform(0, 0.12), rng.uniform(0.25, 0.9)
-    elif kind == "pastel":
-        saturation, value = rng.uniform(0.1, 0.4), rng.uniform(0.4, 0.85)
-    elif kind == "saturated":
-        saturation, value = rng.uniform(0.6, 0.97), rng.uniform(0.25, 0.85)
-    elif kind == "dark":
-        saturation, value = rng.uniform(0, 0.7), rng.uniform(0.02, 0.12)
-    else:
-        hue, saturation, value = rng.uniform(0.04, 0.11), rng.uniform(0.4, 0.75), rng.uniform(0.12, 0.6)
+    kind = str(rng.choice(list(_PAINTS), p=[chance for chance, _, _ in _PAINTS.values()]))
+    if kind == "wood":
+        hue = rng.uniform(0.04, 0.11)
+    saturation, value = (rng.uniform(*limits) for limits in _PAINTS[kind][1:])
     red, green, blue = colorsys.hsv_to_rgb(float(hue), float(saturation), float(value))
     return max(red, 0.02), max(green, 0.02), max(blue, 0.02)
 

@@ -48,7 +48,9 @@ class SequenceTracer(Tracer):
         self.paths_per_pass = _SCALAR_PASS if stage.scalar else max(1, WAVEFRONT // (size[0] * size[1]))
 
     def frame(self, frame: int, paths: int, seed: Sequence[int]) -> dict[str, Array]:
-        """Color and features of the same independent samples, by buffer names, ``(H*W, C)``."""
+        """Color of independent samples, and on a film features of the same, by buffer names, ``(H*W, C)``."""
+        if self.exact:
+            return {"color": self.radiance(frame, paths, seed)}
         return self._buffers(frame, self.trace(frame, paths, seed, even=self.film.spreads))
 
     def features(self, frame: int) -> dict[str, Array]:

@@ -160,9 +160,7 @@ def _render_noisy(
         paths = min(per_pass, job.spp - start)
         # The stream 1 belongs to the reference.
         seed = (job.seed, number, 1 + noise_seed if noise_seed else 0, index)
-        found = (
-            {"color": tracer.radiance(number, paths, seed)} if job.film is None else tracer.frame(number, paths, seed)
-        )
+        found = tracer.frame(number, paths, seed)
         for name, values in found.items():
             total[name] = total.get(name, 0) + paths * values
         if job.keep_samples:
@@ -213,4 +211,4 @@ def _reliable_noise(halves: ReferenceHalves) -> float | None:
 
 def _image(values: Array, size: tuple[int, int]) -> torch.Tensor:
     width, height = size
-    return as_tensor(values.reshape(height, width, -1))
+    return as_tensor(values.reshape(height, width, -1).astype(np.float32))

@@ -231,14 +231,13 @@ def fill_top(
     for _ in range(int(rng.integers(1, most + 1))):
         model = stock.model(rng, small)
         size = float(rng.uniform(0.06, 0.3)) * min(1.0, max(width, depth))
-        procedural = model is None or rng.random() < 0.2
-        spot = surface.find(
-            rng, *((size, size) if procedural or model is None else (model.size[0], model.size[2])), walls=0
-        )
+        if model is not None and rng.random() < 0.2:
+            model = None
+        spot = surface.find(rng, *((size, size) if model is None else (model.size[0], model.size[2])), walls=0)
         if spot is None:
             continue
         where = frame @ place((spot[0], top, spot[1]), spot[2])
-        if procedural or model is None:
+        if model is None:
             builder.add(ornament(builder, rng, size), where, movable=True)
             builder.points.append(where[:3, 3])
         else:
