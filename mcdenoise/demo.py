@@ -11,20 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from mcdenoise.benchmark import BASELINES, Score, Settings, choose_methods, run_benchmark, scores_of
+from mcdenoise.benchmark import BASELINES, Settings, choose_methods, run_benchmark
 from mcdenoise.data import open_sequence
 from mcdenoise.data.files import make_folder
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.folder import denoise_sequence
-from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
-from mcdenoise.metrics import display_codes
-from mcdenoise.models import DEFAULT, Output
-from mcdenoise.models._registry import find_model
-from mcdenoise.report import check_packages, write_report
-from mcdenoise.results import FILE
+from mcdenoise.models import DEFAULT
+from mcdenoise.report import check_packages, kept_pictures, read_picture, write_report
+from mcdenoise.report.gallery import REFERENCE
+from mcdenoise.report.pictures import Image, to_srgb
+from mcdenoise.results import FILE, Results
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import render_sequence
 from mcdenoise.sequence_report import SequenceReport
@@ -48,8 +46,7 @@ class DemoResult:
     """The results of the demonstration.
 
     Args:
-        scores: errors of the noisy and the accumulated image, those on the way and the result, over the frames with
-            references.
+        results: errors and run times of several methods, over the frames with references.
         report: run times by stage, and what was done.
         picture: noisy, accumulated, by Open Image Denoise in its best setting where that is installed, denoised and
             reference side by side, with close-ups.
@@ -57,7 +54,7 @@ class DemoResult:
         page: the report of error against run time of several methods.
     """
 
-    scores: list[Score]
+    results: Results
     report: SequenceReport
     picture: Path
     denoised: Path
@@ -104,54 +101,46 @@ def run_demo(
         progress=on_render,
     )
     sequence = open_sequence(out / "sequence")
-    peer = parse_method(PEER).denoiser() if find_model("oidn").installed else None
-    last: list[tuple[Frame, Output, Tensor | None]] = []
-
-    def show(frame: Frame, output: Output) -> None:
-        last[:] = [(frame, output, peer(frame) if peer else None)]
-        on_frame()
-
-    report = denoise_sequence(sequence, out / "denoised", denoiser, spelling.name, references=True, on_output=show)
-    picture = out / "demo.png"
-    write_png(picture, _sheet(*last[0]))
-    folder, scores = _compare(out, model, on_compare)
-    names = {*BASELINES, spelling.name, *(f"{spelling.name}, {stage}" for stage in last[0][1].stages)}
-    shown = [score for score in scores if score.method in names]
-    return DemoResult(shown, report, picture, out / "denoised", write_report(folder))
+    report = denoise_sequence(sequence, out / "denoised", denoiser, spelling.name, on_frame=on_frame)
+    folder, picture = out / "report", out / "demo.png"
+    results = _compare(out, folder, model, on_compare)
+    write_png(picture, _sheet(folder, results, spelling.name))
+    return DemoResult(results, report, picture, out / "denoised", write_report(folder))
 
 
-def _compare(out: Path, model: str, on_step: Callable[[int, int], None]) -> tuple[Path, list[Score]]:
-    """Several methods on the frames of the demonstration; the folder of the results, and the errors."""
-    folder, threads = out / "report", torch.get_num_threads()
+def _compare(out: Path, folder: Path, model: str, on_step: Callable[[int, int], None]) -> Results:
+    """Several methods on the frames of the demonstration."""
     if os.path.exists(folder / FILE):
         shutil.rmtree(folder)
     settings = Settings(
         rounds=1,
-        threads=threads,
+        threads=torch.get_num_threads(),
         pictures=_PICTURES,
-        on_the_way=True,
         memory=False,
         command=f"mcdenoise demo -o {shlex.quote(str(out))} --model {shlex.quote(model)}",
     )
     sequence = replace(open_sequence(out / "sequence"), name="demo")
     methods = choose_methods(COMPARED, precisions="float32", baselines=(*BASELINES, model))
-    return folder, scores_of(run_benchmark([sequence], methods, folder, settings, on_step=on_step))
+    return run_benchmark([sequence], methods, folder, settings, on_step=on_step)
 
 
-def _sheet(frame: Frame, output: Output, peer: Tensor | None) -> Picture:
-    """A frame several times side by side, and under each image a close-up."""
+def _sheet(folder: Path, results: Results, model: str) -> Picture:
+    """The last frame several times side by side, and under each image a close-up."""
+    (scene,) = results.scenes
+    files, last = kept_pictures(folder, results, scene), scene.pictures[-1]
     shown = {
-        "1 sample a pixel": frame.color,
-        "accumulated": output.stages.get("accumulated"),
-        "Open Image Denoise": peer,
-        "mcdenoise": output.image,
-        f"reference, {REFERENCE_SPP} samples": frame.reference,
+        "1 sample a pixel": "noisy",
+        "accumulated": "accumulated",
+        "Open Image Denoise": parse_method(PEER).name,
+        "mcdenoise": model,
+        f"reference, {REFERENCE_SPP} samples": REFERENCE,
     }
-    return np.concatenate([_column(text, image) for text, image in shown.items() if image is not None], 1)
+    images = {text: files[name][last] for text, name in shown.items() if name in files}
+    return np.concatenate([_column(text, read_picture(path, scene)) for text, path in images.items()], 1)
 
 
-def _column(text: str, image: Tensor) -> Picture:
-    picture = display_codes(image[0]).permute(1, 2, 0).cpu().numpy()
+def _column(text: str, image: Image) -> Picture:
+    picture = to_srgb(image)
     height, width, _ = picture.shape
     left, top, wide, high = _CLOSE_UP
     x, y = int(left * width), int(top * height)

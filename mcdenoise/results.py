@@ -155,7 +155,6 @@ class Cell:
         computing: milliseconds per frame in memory, without reading and writing files; measured as a whole, so that the
             stages may add up to slightly less.
         plan: the skipped stages and the reasons.
-        on_the_way: errors of the intermediate images, by stage, if they were requested.
         lacking: whether the method failed because the scene lacks buffers that it needs; then the run has not failed.
     """
 
@@ -169,7 +168,6 @@ class Cell:
     failure: str = ""
     computing: Spread | None = None
     plan: list[dict[str, Any]] = field(default_factory=list)
-    on_the_way: dict[str, dict[str, Number]] = field(default_factory=dict)
     lacking: bool = False
 
     @property

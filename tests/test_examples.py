@@ -123,14 +123,6 @@ def test_fitted_filter_is_better_on_held_out_frames(small_sequence: Path) -> Non
     assert after < before
 
 
-def test_unseen_scenes_sweeps_any_settings(small_sequence: Path, weights: Path) -> None:
-    models = f"{weights}(alpha_min=0.1|0.5),{weights}"
-    lines = run("unseen_scenes.py", small_sequence, "--models", models, "--no-flip", "--frames", "0-2").splitlines()
-    images = [line[15:].partition("  ")[0].strip() for line in lines[1:]]
-    assert images[:2] == ["noisy", "accumulated"]
-    assert images[2:] == ["cascaded, best of 2 settings", "small, initial", "small"]
-
-
 def test_run_time_prints_a_line_for_each_method(tmp_path: Path) -> None:
     file = tmp_path / "times.json"
     models = ("accumulated", "wild_small(alpha_min=0.2)", f"{EXAMPLES / 'compose_denoiser.py'}:method")

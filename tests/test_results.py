@@ -39,7 +39,6 @@ def results() -> Results:
                 {"read": SPREAD},
                 5.0,
                 computing=SPREAD,
-                on_the_way={"initial": {"SMAPE": 0.2}},
             ),
         ],
         costs=[Cost("ours", 10, 20, SPREAD), Cost("ours", 1000, 2000, failure="too little memory")],

@@ -26,7 +26,6 @@ from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError, MissingBufferError
 from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
-from mcdenoise.models import Output
 from mcdenoise.models._report import Stage, summarize
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
@@ -34,8 +33,6 @@ from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spre
 _WHOLE, _COMPUTING = "whole", "computing"
 # This method returns its input; its run time is not divided into stages.
 _IDENTITY = "noisy"
-# Intermediate images that are also results of a method of their own.
-_METHODS_TOO = ("noisy", "accumulated")
 
 
 @dataclass(frozen=True)
@@ -43,15 +40,12 @@ class Settings:
     """Settings of a benchmark.
 
     Args:
-        rounds: number of timed repetitions per frame, and per image size, after warming up; with 0 only errors are
-            measured.
+        rounds: number of timed repetitions per frame, and per image size, after warming up.
         threads: number of threads of torch, of methods that do not use torch, and of reading and writing EXRs.
         device: ``"cpu"`` or ``"cuda"``.
         sizes: widths and heights for measuring run time over pixels, see :func:`mcdenoise.benchmark.parse_sizes`.
         pictures: maximum number of frames per scene whose images are stored.
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
-        flip_every: compute FLIP, which is slow, only for every n-th frame with a reference.
-        on_the_way: whether to score intermediate images too, such as ``initial``.
         memory: whether to measure the peak memory of each method, in separate processes.
         command: the command line, to be stored with the results.
 
@@ -65,16 +59,13 @@ class Settings:
     sizes: tuple[Size, ...] = ()
     pictures: int = 4
     metrics: tuple[str, ...] = USUAL
-    flip_every: int = 1
-    on_the_way: bool = False
     memory: bool = True
     command: str = ""
 
     def __post_init__(self) -> None:
-        for name, minimum in (("rounds", 0), ("threads", 1), ("pictures", 0), ("flip_every", 1)):
+        for name, minimum in (("rounds", 1), ("threads", 1), ("pictures", 0)):
             if getattr(self, name) < minimum:
-                option = name.replace("_", "-")
-                raise InputError(f"--{option}: expected at least {minimum}, found {getattr(self, name)}")
+                raise InputError(f"--{name}: expected at least {minimum}, found {getattr(self, name)}")
         check_device(self.device)
 
 
@@ -117,7 +108,7 @@ def run_benchmark(
         check_references(sequence)
     fix_threads(settings.threads)
     total = sum((settings.rounds + 1) * len(sequence) for sequence in sequences)
-    total += len(settings.sizes) * (settings.rounds + 2) if settings.rounds else 0
+    total += len(settings.sizes) * (settings.rounds + 2)
     steps = iter(range(1, total + 1))
     with new_folder(out) as folder:
         results = _measure(sequences, methods, folder, settings, lambda: on_step(next(steps), total))
@@ -140,11 +131,10 @@ def _measure(
         skipped |= run.errors.skipped
         scenes.append(scene)
         cells += own
-    sizes = list(settings.sizes) if settings.rounds else []
     costs, fits = measure_sizes(
         [method for method in made.methods if method.model != _IDENTITY],
         made.denoisers,
-        sizes,
+        list(settings.sizes),
         rounds=settings.rounds,
         threads=settings.threads,
         device=settings.device,
@@ -184,7 +174,7 @@ class _SceneRun:
     """Runs all methods on one scene."""
 
     def __init__(self, sequence: Sequence, made: _Made, folder: Path, settings: Settings) -> None:
-        self.errors = Errors(settings.metrics, settings.flip_every)
+        self.errors = Errors(settings.metrics)
         self._sequence, self._made, self._settings = sequence, made, settings
         self._failures = dict(made.failures)
         self._lacking: set[str] = set()
@@ -192,7 +182,6 @@ class _SceneRun:
         self._watch = Stopwatch(settings.device)
         self._times: dict[str, dict[str, list[float]]] = {method.name: {} for method in made.methods}
         self._planned: dict[str, list[list[Stage]]] = {method.name: [] for method in made.methods}
-        self._stages: dict[str, dict[str, None]] = {method.name: {} for method in made.methods}
         height, width = sequence.size
         self._scene = Scene(
             sequence.name,
@@ -229,22 +218,15 @@ class _SceneRun:
             if kept and frame.reference is not None:
                 self._keep("reference", number, frame.reference, primaries)
             for method, timed in self._at_work():
-                output: Output | None = None
+                image: Tensor | None = None
                 with self._noted(method.name):
-                    output = timed.denoiser.output(frame) if self._settings.on_the_way else Output(timed(frame))
+                    image = timed(frame)
                     self._planned[method.name].append(list(timed.denoiser.report.stages.values()))
                     if frame.reference is not None:
-                        self._compare(method.name, number, output, frame.reference)
-                if kept and output is not None and method.name not in self._failures:
-                    self._keep(method.folder, number, output.image, primaries)
+                        self.errors.add(method.name, number, image, frame.reference)
+                if kept and image is not None and method.name not in self._failures:
+                    self._keep(method.folder, number, image, primaries)
             on_step()
-
-    def _compare(self, name: str, number: int, output: Output, reference: Tensor) -> None:
-        self.errors.add(name, number, output.image, reference)
-        for stage, image in output.stages.items():
-            if stage.rpartition(".")[2] not in _METHODS_TOO:
-                self._stages[name][stage] = None
-                self.errors.add(_of(name, stage), number, image, reference)
 
     def _round(self, on_step: Callable[[], None]) -> None:
         first = self._sequence.numbers[0]
@@ -316,30 +298,19 @@ class _SceneRun:
         if name in self._failures:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name], lacking=name in self._lacking)
-        cell = Cell(
+        times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
+        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
+        return Cell(
             self._scene.name,
             name,
             self.errors.means(name),
             self.errors.spreads(name),
-            plan=summarize(self._planned[name]),
-            on_the_way={stage: self.errors.means(_of(name, stage)) for stage in self._stages[name]},
-        )
-        if not self._settings.rounds:
-            return cell
-        times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
-        frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
-        return replace(
-            cell,
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
             memory=self._made.peaks.of(method, self._sequence.size, frames) if self._settings.memory else None,
             computing=times[_COMPUTING],
+            plan=summarize(self._planned[name]),
         )
-
-
-def _of(method: str, stage: str) -> str:
-    """Name of an intermediate image."""
-    return f"{method}, {stage}"
 
 
 def kept_frames(numbers: list[int], scored: list[int], maximum: int) -> list[int]:

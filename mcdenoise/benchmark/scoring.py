@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,29 +12,21 @@ from mcdenoise.evaluate import METRICS, USUAL, measure
 from mcdenoise.results import Spread
 
 
-class _Previous(NamedTuple):
-    number: int
-    image: Tensor
-    reference: Tensor
-
-
 class Errors:
     """Accumulates the errors of any number of methods, frame by frame; stores only the previous image of each.
 
     Args:
         metrics: names in :data:`mcdenoise.evaluate.METRICS`.
-        flip_every: compute FLIP, which is slow, only for every n-th frame.
 
     Attributes:
         skipped: reasons, by metric, why it could not be computed for one or all images, such as a missing package.
     """
 
-    def __init__(self, metrics: Collection[str] = USUAL, flip_every: int = 1) -> None:
+    def __init__(self, metrics: Collection[str] = USUAL) -> None:
         self.skipped: dict[str, str] = {}
         self._metrics = {name: METRICS[name] for name in METRICS if name in metrics}
-        self._flip_every = flip_every
-        self._count: dict[str, int] = {}
-        self._previous: dict[str, _Previous] = {}
+        # Number, image and reference of the last frame of each method.
+        self._last: dict[str, tuple[int, Tensor, Tensor]] = {}
         self._values: dict[str, dict[str, list[float]]] = {}
 
     @torch.inference_mode()
@@ -48,19 +39,12 @@ class Errors:
             image: ``(1, 3, H, W)`` scene-linear radiance.
             reference: of the same shape, on the same device.
         """
-        previous = self._previous.get(method)
-        if previous is not None and previous.number != number - 1:
-            previous = None
-        before = None if previous is None else (previous.image, previous.reference)
-        count = self._count.setdefault(method, 0)
-        self._count[method] += 1
-        metrics = {
-            name: metric for name, metric in self._metrics.items() if name != "FLIP" or not count % self._flip_every
-        }
+        last = self._last.get(method)
+        before = last[1:] if last is not None and last[0] == number - 1 else None
         values = self._values.setdefault(method, {})
-        for name, value in measure(metrics, image, reference, before, self.skipped).items():
+        for name, value in measure(self._metrics, image, reference, before, self.skipped).items():
             values.setdefault(name, []).append(value)
-        self._previous[method] = _Previous(number, image, reference)
+        self._last[method] = number, image, reference
 
     def means(self, method: str) -> dict[str, float]:
         """Mean of each metric; metrics with infinite values are skipped, such as the PSNR of a perfect image."""

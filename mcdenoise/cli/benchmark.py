@@ -114,8 +114,6 @@ def benchmark(
         return 0
     if out is None:
         raise InputError("--out: expected a folder to write to, found none; give one with -o")
-    if rounds < 1:
-        raise InputError(f"--rounds: expected at least 1, found {rounds}")
     check_packages()
     opened = [open_sequence(sequence, frames) for sequence in sequences]
     methods = choose_methods(models, precisions=precisions or "float32,bfloat16", keep_all=keep_all)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mcdenoise.benchmark.tables import scene_rows
 from mcdenoise.cli._options import Out
 from mcdenoise.cli._output import print_rows, print_times, progress_bar, say
 from mcdenoise.demo import FRAMES, run_demo
@@ -32,14 +33,7 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
             on_frame=lambda: progress.advance(denoising),
             on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
         )
-    print_rows(
-        [
-            {"image": score.method}
-            | {name: f"{score.values[name]:.4g}" if name in score.values else "-" for name in result.scores[0].values}
-            | {"frames": str(score.frames)}
-            for score in result.scores
-        ]
-    )
+    print_rows(scene_rows(result.results))
     print_times(result.report.milliseconds)
     for what, path in {"clean frames": result.denoised, "picture": result.picture, "report": result.page}.items():
         say(f"{what}: {path}")

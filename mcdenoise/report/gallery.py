@@ -87,9 +87,9 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
     Raises:
         InputError: a picture is damaged, or of another size than the scene.
     """
-    files = _files(folder, results, scene)
+    files = kept_pictures(folder, results, scene)
     codes = {
-        name: {number: encode(_smaller(_read(path, scene), factor)) for number, path in own.items()}
+        name: {number: encode(_smaller(read_picture(path, scene), factor)) for number, path in own.items()}
         for name, own in files.items()
     }
     denoisers = {method.name for method in results.methods if method.kind != "baseline"}
@@ -113,13 +113,13 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
 def picture_pixels(folder: Path, results: Results) -> int:
     """How many pixels all kept pictures have together."""
     return sum(
-        scene.width * scene.height * sum(len(own) for own in _files(folder, results, scene).values())
+        scene.width * scene.height * sum(len(own) for own in kept_pictures(folder, results, scene).values())
         for scene in results.scenes
     )
 
 
-def _files(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
-    """The files of kept pictures by method and frame, the reference last."""
+def kept_pictures(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
+    """The files of the pictures that a benchmark in a folder kept, by method and frame, the reference last."""
     sources = {method.name: method.folder for method in results.methods if _ran(results, scene, method)}
     found = {
         name: {number: folder / IMAGES / scene.name / place / f"{number}.exr" for number in scene.pictures}
@@ -134,7 +134,12 @@ def _ran(results: Results, scene: Scene, method: Method) -> bool:
     return not method.missing and cell is not None and not cell.failure
 
 
-def _read(path: Path, scene: Scene) -> Image:
+def read_picture(path: Path, scene: Scene) -> Image:
+    """A kept picture, ``(H, W, 3)``, scene-linear, with the primaries of Rec. 709.
+
+    Raises:
+        InputError: it is damaged, or of another size than the scene.
+    """
     pixels, channels, metadata = read_exr(path)
     if pixels.shape[:2] != (scene.height, scene.width) or len(channels) < 3:
         raise InputError(
@@ -154,7 +159,7 @@ def _smaller(image: Image, factor: int) -> Image:
 def _close_ups(
     files: dict[str, dict[int, Path]], scene: Scene, frame: int, denoisers: set[str]
 ) -> tuple[dict[str, list[CloseUp]], str]:
-    images = {name: _read(own[frame], scene) for name, own in files.items() if frame in own}
+    images = {name: read_picture(own[frame], scene) for name, own in files.items() if frame in own}
     reference = images[REFERENCE]
     crops = choose_crops([image for name, image in images.items() if name in denoisers], reference)
     close_ups = {}

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mcdenoise.data.exr import Image, read_exr
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
-from mcdenoise.report.pictures import Crop, crop_errors, to_srgb
-from mcdenoise.results import IMAGES, Results
+from mcdenoise.report.gallery import REFERENCE, kept_pictures, read_picture
+from mcdenoise.report.pictures import Crop, Image, crop_errors, to_srgb
+from mcdenoise.results import Results
 from mcdenoise.suite.rows import Row
 
 # Crops of each scene: left, top, right and bottom as fractions of the frame.
@@ -79,17 +79,12 @@ def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: 
 
 def _pictures(folder: Path, results: Results, row: Row, shown: Sequence[str]) -> list[tuple[str, Image]]:
     """The last stored frame of each method, and last the reference."""
-    folders = {method.name: method.folder for method in results.methods}
     scene = next((scene for scene in results.scenes if scene.name == row.name), None)
     if scene is None or not scene.pictures:
         return []
-    named = [(name, folders[name]) for name in shown if name in folders] + [("reference", "reference")]
-    found = []
-    for name, place in named:
-        path = folder / IMAGES / row.name / place / f"{scene.pictures[-1]}.exr"
-        if path.is_file():
-            found.append((name, np.ascontiguousarray(read_exr(path)[0][..., :3])))
-    return found
+    files, last = kept_pictures(folder, results, scene), scene.pictures[-1]
+    there = [name for name in (*shown, REFERENCE) if last in files.get(name, ())]
+    return [(name, read_picture(files[name][last], scene)) for name in there]
 
 
 def _column(title: str, image: Image, reference: Image, crop: Crop) -> Picture:
