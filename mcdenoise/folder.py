@@ -56,10 +56,8 @@ def denoise_sequence(
     *,
     full_float: bool = False,
     output_layer: str | None = None,
-    references: bool = False,
     picked: str = "",
     on_frame: Callable[[], None] = lambda: None,
-    on_output: Callable[[Frame, Output], None] | None = None,
     on_written: Callable[[str, Tensor, Metadata], None] | None = None,
 ) -> SequenceReport:
     """Denoise a sequence, and write its files (:meth:`mcdenoise.data.Sequence.write`) and ``OUT/denoise.json``.
@@ -74,10 +72,8 @@ def denoise_sequence(
         model: name of the model in the report.
         full_float: write the radiance as 32-bit floats, whatever its type was before.
         output_layer: name of a layer to add; no layer is replaced then.
-        references: also read references, for ``on_output``.
         picked: see :class:`SequenceReport`.
         on_frame: called after each denoised frame.
-        on_output: called with each frame and its output including stages, which need additional memory.
         on_written: called with the name of each written file without ``.exr``, its image ``(1, 3, H, W)`` and its
             metadata, in the order of the frames, in the writing thread; such as ``Preview.add``.
 
@@ -95,9 +91,7 @@ def denoise_sequence(
         report,
         full_float=full_float,
         output_layer=output_layer,
-        references=references,
         on_frame=on_frame,
-        on_output=on_output,
         on_file=on_written
         and (lambda number, image: on_written(report.files[number].stem, image, sequence.metadata(number))),
     )
@@ -125,11 +119,9 @@ def write_frames(
     *,
     full_float: bool = False,
     output_layer: str | None = None,
-    references: bool = False,
     unwritten: Collection[int] = (),
     of: int | None = None,
     on_frame: Callable[[], None] = lambda: None,
-    on_output: Callable[[Frame, Output], None] | None = None,
     on_file: Callable[[int, Tensor], None] | None = None,
 ) -> None:
     """Denoise frames one after the other and write their files; :func:`denoise_sequence` does this for a whole shot.
@@ -141,11 +133,9 @@ def write_frames(
         report: the report to fill in.
         full_float: see :func:`denoise_sequence`.
         output_layer: see :func:`denoise_sequence`.
-        references: see :func:`denoise_sequence`.
         unwritten: frames that are denoised only to give the others their history; no files are written for them.
         of: number of frames of the whole shot, if these are its beginning; by default the shot ends with them.
         on_frame: see :func:`denoise_sequence`.
-        on_output: see :func:`denoise_sequence`.
         on_file: called with the number and the image ``(1, 3, H, W)`` of each frame, in the writing thread, after its
             file has been written, if it gets one.
 
@@ -160,12 +150,7 @@ def write_frames(
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] = writer.submit(lambda: None)
         seen: Tensor | None = None
-        for number, frame, output in denoised_frames(
-            sequence, denoiser, reference=references, stages=on_output is not None, of=of
-        ):
-            if on_output is not None:
-                on_output(frame, output)
-                output = output._replace(stages={})
+        for number, frame, output in denoised_frames(sequence, denoiser, reference=False, of=of):
             seen, before = _thumbnail(frame), seen
             follows = tells_motion(frame.buffers) and not denoiser.report.repeats
             if follows and _finds_nothing(denoiser.report, frame) and _alike(seen, before):
@@ -229,7 +214,6 @@ def denoised_frames(
     denoiser: Denoiser,
     *,
     reference: bool = True,
-    stages: bool = False,
     of: int | None = None,
 ) -> Iterator[tuple[int, Frame, Output]]:
     """Denoise frame after frame, while the next one is read if memory allows.
@@ -238,7 +222,6 @@ def denoised_frames(
         sequence: the frames.
         denoiser: the denoiser; it is reset first.
         reference: also read references.
-        stages: also return stages.
         of: see :func:`write_frames`.
 
     Yields:
@@ -261,7 +244,7 @@ def denoised_frames(
         except InputError as error:
             raise FrameError(str(error), number) from error
         try:
-            output = denoiser.output(frame, stages=stages)
+            output = denoiser.output(frame, stages=False)
         except InputError as error:
             raise FrameError(f"{sequence.root}, frame {number}: {error}", number) from error
         denoiser.report.milliseconds = {"waiting": waiting, **denoiser.report.milliseconds}

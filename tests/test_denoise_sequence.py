@@ -34,17 +34,7 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
     for number in sequence.numbers:
         color = small_sequence / "inputs" / f"color{number}.exr"
         write_exr(color, read_exr(color)[0], ["R", "G", "B"], metadata={"Owner": f"frame {number}", "camera": 1.5})
-    seen: list[tuple[bool, bool]] = []
-    denoise_sequence(
-        sequence,
-        out,
-        Denoiser(small_model()),
-        "small",
-        on_output=lambda frame, output: seen.append(
-            (frame.reference is None, output.stages["noisy"].equal(frame.color))
-        ),
-    )
-    assert seen == [(True, True)] * 2
+    denoise_sequence(sequence, out, Denoiser(small_model()), "small")
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
     denoiser = Denoiser(small_model())
     for number in sequence.numbers:
