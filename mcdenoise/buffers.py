@@ -93,8 +93,8 @@ MATRIX = "view_projection"
 _ANYTHING = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "anything", infinite=True)
 
 
-def check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]:
-    """The clamped values, and their minimum and maximum."""
+def check_values(name: str, value: Tensor) -> Tensor:
+    """The values, clamped to the range of their buffer."""
     spec = _spec_of(name)
     low, high = (float(extreme) for extreme in torch.aminmax(value.detach()))
     # NaN propagates through minimum and maximum and fails the comparison; only then is every value checked again.
@@ -103,9 +103,9 @@ def check_values(name: str, value: Tensor) -> tuple[Tensor, tuple[float, float]]
         place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
         _refuse_illegal(name, int(bad.sum()), f", {place}")
     if low >= spec.low and high <= spec.high:
-        return value, (low, high)
+        return value
     _refuse_range(name, low, high, float(_above(spec, value)) if high > _limit(spec) else 0.0)
-    return value.clamp(spec.low, spec.high), (max(low, spec.low), min(high, spec.high))
+    return value.clamp(spec.low, spec.high)
 
 
 def clamped(

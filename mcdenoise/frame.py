@@ -30,8 +30,8 @@ from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.light import Repairs, is_valid, repair, repairs_from
 
 # The vocabulary of buffers belongs to frames.
-__all__ = ["BUFFERS", "LAYOUTS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Inspected"]
-__all__ += ["Layout", "Skip", "Unread", "scale_samples", "tells_motion"]
+__all__ = ["BUFFERS", "LAYOUTS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Layout"]
+__all__ += ["Skip", "Unread", "scale_samples", "tells_motion"]
 
 
 class Hints(NamedTuple):
@@ -314,13 +314,12 @@ class Frame:
                 value at all, or half as much negative light as positive; or a layer has that, or invalid values in
                 more than a tenth of the pixels in which ``color`` is valid.
         """
-        inspected = self.inspect()
-        return inspected.frame, inspected.repairs.pixels
+        frame, repairs = self.inspect()
+        return frame, repairs.pixels
 
-    def inspect(self) -> Inspected:
-        """Like :meth:`validate`, and also return the ranges of the other buffers."""
+    def inspect(self) -> tuple[Frame, Repairs]:
+        """Like :meth:`validate`, and tell all that was invalid in ``color`` and the layers."""
         changes: dict[str, Any] = {}
-        ranges: dict[str, tuple[float, float]] = {}
         repairs = Repairs()
         if not all(map(is_valid, (self.color, *self.layers.values()))):
             repaired = repair(self.color, self.layers, reads=True)
@@ -328,10 +327,10 @@ class Frame:
             changes |= {"color": repaired.color, "layers": repaired.layers}
         for name, value in self.items():
             if name != "color":
-                clean, ranges[name] = check_values(name, value)
+                clean = check_values(name, value)
                 if clean is not value:
                     changes[name] = clean
-        return Inspected(self.replace(**changes) if changes else self, repairs, ranges)
+        return self.replace(**changes) if changes else self, repairs
 
     def repaired(self) -> Unread:
         """Like :meth:`validate` without waiting for the device: repair everything, and read nothing.
@@ -393,20 +392,6 @@ pytree.register_pytree_node(
     to_dumpable_context=lambda context: [list(context[0]), list(context[1])],
     from_dumpable_context=lambda context: (tuple(context[0]), Hints(*context[1])),
 )
-
-
-class Inspected(NamedTuple):
-    """A validated frame, and its ranges.
-
-    Args:
-        frame: with valid values.
-        repairs: what was invalid in ``color`` and the layers.
-        ranges: minimum and maximum of every buffer but ``color``, by name.
-    """
-
-    frame: Frame
-    repairs: Repairs
-    ranges: dict[str, tuple[float, float]]
 
 
 def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ def prepared(frame: Frame, report: FrameReport, doubt: Callable[[str], None]) ->
     if void.mask is not None:
         report.add([Note("void", "filled from around, and kept")])
     if at_hand(frame.color.device):
-        frame, report.repairs, _ = frame.inspect()
+        frame, report.repairs = frame.inspect()
         doubt(report.repairs.doubt)
     else:
         frame, numbers, judge = frame.repaired()
