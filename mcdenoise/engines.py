@@ -17,7 +17,7 @@ from functools import partial
 from importlib.metadata import version
 from typing import Any, TypeAlias
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, in_one_line
 from mcdenoise.interruption import deaf_children, prepare_worker, start_resource_tracker
 
 # A task that has lost its worker this many times has failed.
@@ -69,7 +69,7 @@ def run_tasks(engine: Engine, tasks: deque[Task], on_wait: Callable[[], object] 
                         continue
                     outcome = None, f"its worker was lost, {task.losses} times ({type(error).__name__})"
                 except Exception as error:  # an answer that cannot be sent
-                    outcome = None, describe_error(error)
+                    outcome = None, in_one_line(error)
                 task.on_end(*outcome)
             on_wait()
 
@@ -110,13 +110,7 @@ def _call(driver: str, function: Callable[..., Any], *arguments: Any) -> Outcome
             raise InputError(f"{platform.node()}: expected mcdenoise {driver}, found {version('mcdenoise')}")
         return function(*arguments), None
     except BaseException as error:  # a user's model may even exit, and not every error can be sent
-        return None, describe_error(error)
-
-
-def describe_error(error: BaseException) -> str:
-    """One line that says why a task failed."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"[:500]
+        return None, in_one_line(error)
 
 
 def parse_workers(text: str) -> int | None:
@@ -209,7 +203,7 @@ class RayEngine:
             ray.init(address=address, log_to_driver=False, logging_level="ERROR", include_dashboard=None)
         except Exception as error:  # Ray has no common type of them
             raise InputError(
-                f"--workers {address}: expected a number or a Ray cluster, found: {describe_error(error)}; "
+                f"--workers {address}: expected a number or a Ray cluster, found: {in_one_line(error)}; "
                 "pip install 'mcdenoise[ray]', and start one with `ray start --head`"
             ) from error
         self._ray: Any = ray

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from difflib import get_close_matches
 
 # A channel name may have 255 bytes, and a path 4096.
@@ -18,10 +19,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str = "") -> None:
-        text = printable(message)
-        if len(text) > _LONGEST:
-            text = f"{text[: _LONGEST // 3 * 2]} ... {text[-(_LONGEST // 3) :]}"
-        super().__init__(text)
+        super().__init__(_shortened(printable(message)))
 
 
 class MissingBufferError(InputError):
@@ -35,6 +33,25 @@ def run_script(main: Callable[[], object]) -> None:
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(2)
+
+
+def in_one_line(error: BaseException) -> str:
+    r"""Type and message of an error, such as a user's code raises, in one line; of an :class:`InputError` the message.
+
+    Example:
+        >>> in_one_line(RuntimeError("out of\nmemory"))
+        'RuntimeError: out of memory'
+    """
+    if isinstance(error, InputError):
+        return str(error)
+    name = type(error).__name__
+    if isinstance(error, SystemExit):
+        return f"it ends the program ({name}: {error})"
+    # The text of an exception may be a user's code, too.
+    with suppress(Exception):
+        text = " ".join(str(error).split())
+        return _shortened(f"{name}: {text}" if text else name)
+    return name
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -75,3 +92,7 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 3 * 2]} ... {text[-(_LONGEST // 3) :]}"

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, in_one_line
 
 # Modules beside the file that was executed last, which it has imported.
 _beside: list[str] = []
@@ -65,17 +65,6 @@ def refused(what: str) -> Iterator[None]:
         raise
     except BaseException as error:
         raise InputError(f"{what}: {in_one_line(error)}") from error
-
-
-def in_one_line(error: BaseException) -> str:
-    """Type and message of an error raised by a user's code, in one line."""
-    name = type(error).__name__
-    if isinstance(error, SystemExit):
-        return f"it ends the program ({name}: {error})"
-    # The text of an exception is a user's code, too.
-    with suppress(Exception):
-        return f"{name}: {' '.join(str(error).split())}"
-    return name
 
 
 def _check_file(path: Path, kind: str, thing: str) -> None:

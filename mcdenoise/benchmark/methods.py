@@ -145,12 +145,6 @@ def _everything() -> str:
     return ",".join([COMPARED, *(name for name in list_models() if name not in known)])
 
 
-def one_line(error: BaseException) -> str:
-    """The message of an exception in one line, for a table."""
-    text = " ".join(str(error).split()) or "no reason given"
-    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}"
-
-
 def _variants(method: Method, model: Any, precisions: list[str], keep_all: bool) -> Iterator[Method]:
     """A model in each of the precisions that it has, and also without skipping if it skips work and this is wanted."""
     if not has_network(model):

@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
-from mcdenoise.benchmark.methods import one_line
 from mcdenoise.benchmark.tables import write_ops_csv
 from mcdenoise.check.case import as_tuple, tensors_in
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import DTYPES, relative_error
 from mcdenoise.data.files import new_folder
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, in_one_line
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
@@ -63,7 +62,7 @@ class _Entry:
             gradients = self._differentiate()
             with_derivatives = watch.between(start, watch.mark())
         except Exception as error:  # whatever a backend refuses with: the others go on
-            self.failure = one_line(error)
+            self.failure = in_one_line(error)
             return
         moved = sum(tensor.nbytes for tensor in (*tensors_in(self.inputs), *results)) / 2**20
         self.mebibytes = moved

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
-from mcdenoise.benchmark.methods import Timed, make_method, one_line
+from mcdenoise.benchmark.methods import Timed, make_method
 from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
 from mcdenoise.data.exr import Metadata
-from mcdenoise.data.files import new_folder
+from mcdenoise.data.files import make_folder, new_folder
 from mcdenoise.data.sequences import with_unique_names
-from mcdenoise.errors import InputError, MissingBufferError
+from mcdenoise.errors import InputError, MissingBufferError, in_one_line
 from mcdenoise.evaluate import USUAL, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models._report import Stage, summarize
@@ -167,7 +167,7 @@ class _Made:
             try:
                 self.denoisers[method.name] = make_method(method, threads=settings.threads, device=settings.device)
             except Exception as error:  # a method may raise any exception; the other methods continue
-                self.failures[method.name] = one_line(error)
+                self.failures[method.name] = in_one_line(error)
 
 
 class _SceneRun:
@@ -201,7 +201,7 @@ class _SceneRun:
                 self._round(on_step)
         except InputError as error:
             # A frame cannot be read, so no method has seen the whole scene.
-            reason = one_line(error)
+            reason = in_one_line(error)
             self._failures, self._lacking = {method.name: reason for method in self._made.methods}, set()
             self._scene = replace(self._scene, pictures=[])
             shutil.rmtree(self._folder / IMAGES / self._scene.name, ignore_errors=True)
@@ -279,13 +279,13 @@ class _SceneRun:
         try:
             yield
         except Exception as error:  # a method may raise any exception; the other methods continue
-            self._failures[name] = one_line(error)
+            self._failures[name] = in_one_line(error)
             if isinstance(error, MissingBufferError):
                 self._lacking.add(name)
 
     def _keep(self, folder: str, number: int, image: Tensor, metadata: Metadata) -> None:
         path = self._folder / IMAGES / self._scene.name / folder / f"{number}.exr"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         self._write(path, image, metadata)
 
     @staticmethod

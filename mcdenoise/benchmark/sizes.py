@@ -10,8 +10,8 @@ import torch
 
 from mcdenoise.benchmark.machine import available_memory
 from mcdenoise.benchmark.memory import Peaks
-from mcdenoise.benchmark.methods import Timed, one_line
-from mcdenoise.errors import InputError
+from mcdenoise.benchmark.methods import Timed
+from mcdenoise.errors import InputError, in_one_line
 from mcdenoise.frame import Frame
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.results import Cost, Fit, Method, Spread
@@ -121,7 +121,7 @@ def measure_sizes(
                     made[name](frame)
                     taken = watch.between(start, watch.mark())
                 except Exception as error:  # a method may raise any exception; the other methods continue
-                    failures[name] = one_line(error)
+                    failures[name] = in_one_line(error)
                     continue
                 if turn >= 2:
                     times.setdefault(name, []).append(taken)

@@ -28,9 +28,9 @@ from torch import Tensor
 
 from mcdenoise.check.case import Case, Op, between, constant, map_tensors, tensors_in, times
 from mcdenoise.check.regimes import Argument, checked, extreme, stiff
-from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.errors import InputError, did_you_mean, in_one_line
 from mcdenoise.methods import parse_method
-from mcdenoise.own import in_one_line, load_own
+from mcdenoise.own import load_own
 
 ATTRIBUTE, BESIDE = "example_inputs", "inputs"
 # A Jacobian of this many results and inputs takes 128 MiB.

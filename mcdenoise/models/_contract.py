@@ -12,14 +12,14 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from mcdenoise.buffers import BUFFERS, MATRIX
-from mcdenoise.errors import InputError, MissingBufferError
+from mcdenoise.errors import InputError, MissingBufferError, in_one_line
 from mcdenoise.frame import Frame
 from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._interface import Ask, Model, Needs, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._registry import build_model, find_model, list_models
 from mcdenoise.models._weights import pretrained_models
-from mcdenoise.own import in_one_line, refused
+from mcdenoise.own import refused
 
 
 def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...], ask: Ask) -> tuple[Output, State]:

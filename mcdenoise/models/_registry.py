@@ -15,12 +15,12 @@ from typing import Any
 
 from torch import nn
 
-from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.errors import InputError, did_you_mean, in_one_line
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import outlined, plain_defaults
 from mcdenoise.models._entries import MODELS, Entry
 from mcdenoise.models._interface import Model
-from mcdenoise.own import in_one_line, load_own, refused
+from mcdenoise.own import load_own, refused
 
 GROUP = "mcdenoise.models"
 _FACTORY = "expected a factory, a function without required arguments that returns a model"

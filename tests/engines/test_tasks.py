@@ -57,7 +57,11 @@ def test_lost_tasks_are_retried_and_failed_ones_are_named(tmp_path: Path) -> Non
     run.add("hopeless", die_at_first, tmp_path, "hopeless", MOST_LOSSES)
     run_tasks(LocalEngine(2), run.tasks)
     assert f"{MOST_LOSSES} times" in run.failed.pop("hopeless")
-    assert run.failed == {"failing": "RuntimeError: two lines", "strange": "Strange: 7 and 8", "exits": "SystemExit: 0"}
+    assert run.failed == {
+        "failing": "RuntimeError: two lines",
+        "strange": "Strange: 7 and 8",
+        "exits": "it ends the program (SystemExit: 0)",
+    }
     assert run.answers == {"next": "one", "lost": "lost"}
     # Nobody tries more often than that.
     assert not (tmp_path / "hopeless").exists()

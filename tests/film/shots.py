@@ -11,7 +11,8 @@ import torch
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
-from mcdenoise.engines import Outcome, describe_error
+from mcdenoise.engines import Outcome
+from mcdenoise.errors import in_one_line
 from mcdenoise.film import work
 from mcdenoise.frame import Frame
 
@@ -34,7 +35,7 @@ class Inline:
         try:
             done.set_result((function(*arguments), None))
         except Exception as error:
-            done.set_result((None, describe_error(error)))
+            done.set_result((None, in_one_line(error)))
         return done
 
     def close(self) -> None:

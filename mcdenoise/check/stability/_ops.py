@@ -44,8 +44,8 @@ from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.check.stability._check import DTYPES, Check, bounded
 from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.stability._trial import Function, Trial, backends
+from mcdenoise.errors import in_one_line
 from mcdenoise.ops._window import accumulator_dtype
-from mcdenoise.own import in_one_line
 
 _DEPTH = 8
 _PROBE = 16
