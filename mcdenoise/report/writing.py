@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import make_folder, write_text
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
@@ -52,10 +52,11 @@ def write_report(folder: Path) -> Path:
     results = shortlist(everything, _MOST_METHODS)
     galleries = _galleries(folder, results)
     shown = views(results)
+    first = _first_pair(shown[0], names)
     content = {
         "results": results,
         "others": [method.name for method in everything.methods if method not in results.methods],
-        "verdict": _verdict(shown[0] if shown else View("", []), names),
+        "verdict": _verdict(shown[0], names),
         "created": f"{results.created[:16].replace('T', ' ')} UTC",
         "metrics": [_metric(name) for name in names],
         "columns": [_column(shown, name) for name in names],
@@ -73,8 +74,9 @@ def write_report(folder: Path) -> Path:
         "brightest": f"{BRIGHTEST:g}",
         "close_ups": any(gallery.close_ups for gallery in galleries),
         "profiles": any(gallery.profiles for gallery in galleries),
-        "featured": _featured(results, shown, names),
-    } | _comparer(results, galleries, shown, names)
+        # The methods shown at first in close-ups and profiles.
+        "featured": {results.methods[0].name, *first, REFERENCE},
+    } | _comparer(galleries, first)
     path = folder / FILE
     write_text(path, render_page("report.html.jinja", content))
     return path
@@ -96,7 +98,7 @@ def write_sample_plots(curves: Mapping[str, dict[str, list[tuple[int, float]]]],
     written = []
     for name, own in curves.items():
         path = folder / PLOTS / f"{name}-over-samples.svg"
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         with plots.plot_style():
             plots.write_figure(plots.error_over_samples(own, f"SMAPE, {name} (lower is better)"), path)
         written.append(path)
@@ -152,12 +154,7 @@ def _write_plots(folder: Path, results: Results, shown: list[View], names: list[
     from mcdenoise.report import plots
 
     target = folder / PLOTS
-    try:
-        target.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{target}: cannot be made ({error.strerror}); check the folder and its permissions"
-        ) from error
+    make_folder(target)
     colors = plots.model_colors(results.methods)
     errors: list[dict[str, Any]] = []
     stages: list[dict[str, Any]] = []
@@ -205,7 +202,7 @@ def _galleries(folder: Path, results: Results) -> list[Gallery]:
     return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
 
 
-def _comparer(results: Results, galleries: list[Gallery], shown: list[View], names: list[str]) -> dict[str, Any]:
+def _comparer(galleries: list[Gallery], first: list[str]) -> dict[str, Any]:
     """The data of the comparer's script: the pictures, their format, and the two to begin with."""
     pixels = sum(codes.size // 3 for gallery in galleries for own in gallery.codes.values() for codes in own.values())
     kind, options = next((kind, options) for most, kind, options in FORMATS if pixels <= most)
@@ -229,13 +226,12 @@ def _comparer(results: Results, galleries: list[Gallery], shown: list[View], nam
     return {
         "format": "lossless WebP" if kind == "webp" else f"JPEG of quality {options['quality']}",
         "factor": max((gallery.factor for gallery in galleries), default=1),
-        "first": _first_pair(results, shown, names),
         "data": {
             "scenes": scenes,
             "linear": [float(f"{value:.5g}") for value in decode(np.arange(256)).tolist()],
             "heat": _heat_colors(),
             "heatEnd": _HEAT_END,
-            "first": _first_pair(results, shown, names),
+            "first": first,
         },
     }
 
@@ -248,12 +244,10 @@ def _best(view: View, names: list[str], kind: Kind) -> Row | None:
     return min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
 
 
-def _first_pair(results: Results, shown: list[View], names: list[str]) -> list[str]:
+def _first_pair(view: View, names: list[str]) -> list[str]:
     """The pictures to begin with: Open Image Denoise at its best (or else the best filter), and the best network."""
-    if not results.methods:
-        return []
-    rival, ours = (_best(shown[0], names, kind) for kind in ("fixed", "trainable"))
-    return [rival.method.name if rival else results.methods[0].name, ours.method.name if ours else REFERENCE]
+    rival, ours = (_best(view, names, kind) for kind in ("fixed", "trainable"))
+    return [(rival or view.rows[0]).method.name, ours.method.name if ours else REFERENCE]
 
 
 def _verdict(view: View, names: list[str]) -> str:
@@ -274,11 +268,6 @@ def _verdict(view: View, names: list[str]) -> str:
         ratio = ours.milliseconds.value / rival.milliseconds.value
         text += ", in the same time" if 0.95 < ratio < 1.05 else f", in {ratio:.2g} times its time"
     return f"{text}."
-
-
-def _featured(results: Results, shown: list[View], names: list[str]) -> set[str]:
-    """The methods shown at first in close-ups and profiles: the first one, the first pair, and the reference."""
-    return {*(method.name for method in results.methods[:1]), *_first_pair(results, shown, names), REFERENCE}
 
 
 def _metric(name: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mcdenoise.data.files import make_folder
 from mcdenoise.data.png import Picture, caption, enlarge, write_png
 from mcdenoise.report.gallery import REFERENCE, kept_pictures, read_picture
 from mcdenoise.report.pictures import Crop, Image, crop_errors, to_srgb
@@ -69,7 +70,7 @@ def write_close_ups(folder: Path, results: Results, rows: Iterable[Row], shown: 
                 name,
             )
             path = folder / "close-ups" / row.name / f"{name}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             columns = [_column(title, image, reference, crop) for title, image in pictures]
             gap = np.full((len(columns[0]), _GAP, 3), 255, np.uint8)
             write_png(path, np.concatenate([part for column in columns for part in (column, gap)][:-1], 1))

@@ -13,7 +13,7 @@ import numpy as np
 
 from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.data.files import atomic_path, write_json
+from mcdenoise.data.files import atomic_path, make_folder, write_json
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import default_folder, open_assets
 from mcdenoise.scenes.cycles import Blender
@@ -61,11 +61,7 @@ def render_suite(
         if any(shot.renderer == "cycles" and not _is_whole(shot, data) for shot in shots):
             # Before the hours that Mitsuba takes.
             blender = stack.enter_context(Blender())
-        try:
-            data.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            reason = f"cannot be created ({error.strerror})"
-            raise InputError(f"{data}: {reason}; choose another folder with --data") from error
+        make_folder(data)
         for number, (fraction, shot) in enumerate(steps):
             on_step(shot.name, fraction, number, len(steps))
             if shot.renderer == "mitsuba":
@@ -147,7 +143,7 @@ def _take_references(shot: Shot, data: Path) -> None:
         source = data / first.name / "inputs" / f"reference{number}.exr"
         if source.is_file():
             target = data / shot.name / "inputs" / source.name
-            target.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(target.parent)
             with atomic_path(target) as unfinished:
                 shutil.copyfile(source, unfinished)
 
@@ -155,7 +151,7 @@ def _take_references(shot: Shot, data: Path) -> None:
 def _render_cycles(shot: Shot, data: Path, fraction: float, blender: Blender | None, threads: int) -> None:
     folder, parts = data / shot.name, _parts_of(shot, data)
     for each in (folder, parts):
-        each.mkdir(parents=True, exist_ok=True)
+        make_folder(each)
     noisy = {folder / _shot_file(n): (n, shot.samples, _SEED + n) for n in range(shot.frames)}
     samples = max(shot.reference_samples // _PARTS, 1)
     clean = {

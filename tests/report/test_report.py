@@ -13,7 +13,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.report import write_report
 from mcdenoise.report import writing as report_writing
 from mcdenoise.report.pictures import FORMATS
-from mcdenoise.report.views import views
 from mcdenoise.results import Results
 
 VOID = {"meta", "link", "br", "img", "input", "path", "rect", "circle", "use", "hr"}
@@ -111,7 +110,7 @@ def test_more_pictures_are_coarser_and_then_smaller(folder: Path, monkeypatch: p
     for limits in ((1e9, 1e9, 1e9), (1e3, 1e9, 1e9), (1e3, 2e3, 5e4)):
         formats = tuple((most, *each[1:]) for most, each in zip(limits, FORMATS, strict=True))
         monkeypatch.setattr(report_writing, "FORMATS", formats)
-        content = report_writing._comparer(results, report_writing._galleries(folder, results), views(results), [])
+        content = report_writing._comparer(report_writing._galleries(folder, results), [])
         told.append((content["format"], content["factor"], len(json.dumps(content["data"]))))
     assert [each[:2] for each in told] == [("lossless WebP", 1), ("JPEG of quality 88", 1), ("JPEG of quality 75", 2)]
     assert told[0][2] > told[1][2] > told[2][2]

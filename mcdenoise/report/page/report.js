@@ -5,15 +5,12 @@ const element = (id) => document.getElementById(id);
 
 /* Which plots and tables are shown. */
 
-function chosenMetric() {
-  return document.querySelector("input[name=metric]:checked")?.value;
-}
-
 function showChosen() {
   const view = element("view").value;
+  const chosen = document.querySelector("input[name=metric]:checked")?.value;
   for (const part of document.querySelectorAll("[data-view]")) {
     const { view: ofView, metric } = part.dataset;
-    part.hidden = ofView !== view || (metric !== undefined && metric !== chosenMetric());
+    part.hidden = ofView !== view || (metric !== undefined && metric !== chosen);
   }
 }
 
@@ -191,10 +188,10 @@ function startComparer() {
 
   const fitScale = () => Math.min(panes()[0].width / scene().width, panes()[0].height / scene().height);
   const scale = () => fitScale() * state.zoom;
+  const clampZoom = (zoom) => clamp(zoom, 1, Math.max(LARGEST_PIXEL / fitScale(), 1));
 
   function keepInside() {
-    const most = Math.max(LARGEST_PIXEL / fitScale(), 1);
-    state.zoom = clamp(state.zoom, 1, most);
+    state.zoom = clampZoom(state.zoom);
     const { width, height } = panes()[0];
     for (const [axis, size, room] of [
       ["x", scene().width, width],
@@ -344,8 +341,7 @@ function startComparer() {
   function zoomBy(factor, at = { x: panes()[0].width / 2, y: panes()[0].height / 2 }) {
     if (fitScale() === 0) return;
     const fixed = toPicture(at);
-    const most = Math.max(LARGEST_PIXEL / fitScale(), 1);
-    state.zoom = clamp(state.zoom * factor, 1, most);
+    state.zoom = clampZoom(state.zoom * factor);
     const moved = toPicture(at);
     panBy(moved.x - fixed.x, moved.y - fixed.y);
   }
