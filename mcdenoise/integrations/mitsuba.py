@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import importlib
 from collections.abc import Mapping
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -114,29 +114,6 @@ class MitsubaDenoiser:
         self.denoiser = Denoiser(model, device=device, precision=precision, **settings)
         if not isinstance(model, nn.Module) and isinstance(self.denoiser.model, nn.Module):
             self.denoiser.model.requires_grad_(False)
-
-    @overload
-    def __call__(
-        self,
-        noisy: Any,
-        albedo: Any = None,
-        normals: Any = None,
-        to_sensor: Any = None,
-        flow: Any = None,
-        previous_denoised: Any = None,
-    ) -> Any: ...
-
-    @overload
-    def __call__(
-        self,
-        noisy: Any,
-        albedo_ch: str = "",
-        normals_ch: str = "",
-        to_sensor: Any = None,
-        flow_ch: str = "",
-        previous_denoised_ch: str = "",
-        noisy_ch: str = _ROOT,
-    ) -> Any: ...
 
     def __call__(self, noisy: Any, *arguments: Any, **named: Any) -> Any:
         """Denoise a tensor or a bitmap.
