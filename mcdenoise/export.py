@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -51,20 +52,21 @@ class Step(nn.Module):
         self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
         self.given += tuple(sorted(set(buffers) - set(self.given)))
         check_needs(model.needs, self.given)
-        self.axes = _axes(self._example, self.given)
+        small, large = self._example(_SIZE, _BATCH), self._example(_OTHER_SIZE, _OTHER_BATCH)
+        self.axes = {name: _free_axes(small[name], large[name]) for name in self.given}
         # Use the structure of a state after the first frame; the graph keeps it.
-        small, large = self._state_of(_SIZE, _BATCH), self._state_of(_OTHER_SIZE, _OTHER_BATCH)
-        paths, self._spec = pytree.tree_flatten_with_path(small)
+        before, other = self._state_of(small), self._state_of(large)
+        paths, self._spec = pytree.tree_flatten_with_path(before)
         self._names: list[str | None] = _names([path if isinstance(leaf, Tensor) else None for path, leaf in paths])
         self.state = tuple(name for name in self._names if name is not None)
-        others = pytree.tree_leaves(large)
+        others = pytree.tree_leaves(other)
         for (_, a), b, name in zip(paths, others, self._names, strict=True):
             if name is not None:
                 self.axes[f"state.{name}"] = _free_axes(a, b)
 
     @torch.no_grad()
-    def _state_of(self, size: tuple[int, int], batch: int) -> State:
-        return self.model(self.frame(self._example(size, batch)))[1]
+    def _state_of(self, buffers: Mapping[str, Tensor]) -> State:
+        return self.model(self.frame(buffers))[1]
 
     def _example(self, size: tuple[int, int], batch: int) -> dict[str, Tensor]:
         return {name: _example(name, size, batch) for name in self.given}
@@ -78,7 +80,7 @@ class Step(nn.Module):
         """The state before the first frame of a shot with such buffers: zeros."""
         color = buffers["color"]
         size, batch = (int(color.shape[-2]), int(color.shape[-1])), len(color)
-        leaves = pytree.tree_leaves(self._state_of(size, batch))
+        leaves = pytree.tree_leaves(self._state_of(self._example(size, batch)))
         named = zip(self._names, leaves, strict=True)
         return {name: torch.zeros_like(leaf, device=color.device) for name, leaf in named if name is not None}
 
@@ -310,19 +312,14 @@ def _write_onnx(
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress the warnings and logs that torch's exporters cause themselves."""
-    import logging
-
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 def _check_packages(*names: str) -> None:
@@ -342,11 +339,6 @@ def _example(name: str, size: tuple[int, int], batch: int) -> Tensor:
     shape = (batch, 2, 3, *size) if name == "samples" else (batch, channels, *size)
     values = torch.rand(shape, generator=drawn) * 0.9 + 0.1
     return nn.functional.normalize(values, dim=1) if name == "normal" else values
-
-
-def _axes(example: Callable[[tuple[int, int], int], dict[str, Tensor]], names: tuple[str, ...]) -> dict[str, Any]:
-    small, large = example(_SIZE, _BATCH), example(_OTHER_SIZE, _OTHER_BATCH)
-    return {name: _free_axes(small[name], large[name]) for name in names}
 
 
 def _free_axes(small: Tensor, large: Tensor) -> dict[int, Any]:
