@@ -14,9 +14,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import is_dataclass
 from inspect import cleandoc, signature
-from pathlib import Path
 from typing import Any, get_type_hints
 
 from mcdenoise.cli._stdout import forgiving_stdout
@@ -141,7 +139,11 @@ def _run(name: str, arguments: list[str]) -> int:
     except SystemExit as stop:
         # The help of the command was printed.
         return int(stop.code or 0)
-    _check_json(command)
+    given: dict[str, Any] = getattr(command, "keywords", {})
+    if given.get("json") is not None:
+        from mcdenoise.cli._output import check_json
+
+        check_json(given)
     try:
         return command() or 0
     except SystemExit as stop:
@@ -161,24 +163,6 @@ def _no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-def _check_json(command: Callable[[], int | None]) -> None:
-    """Check before the work of a command that its file of ``--json``, if it has one, can be written."""
-    given: dict[str, Any] = getattr(command, "keywords", {})
-    if given.get("json") is None:
-        return
-    from mcdenoise.cli._output import check_json
-
-    inputs: list[Path] = []
-    # Groups of options contain paths too.
-    grouped = [each for group in given.values() if is_dataclass(group) for each in vars(group).values()]
-    for name, value in (*given.items(), *(("", each) for each in grouped)):
-        if name not in ("json", "out"):
-            inputs += (
-                each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path)
-            )
-    check_json(given["json"], inputs, given.get("out"))
 
 
 def load_command(name: str) -> Command:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +50,6 @@ def console_of_tables() -> Console:
     return console if console.is_terminal else Console(width=200)
 
 
-def show(table: Table) -> None:
-    """Print a table to stdout."""
-    console_of_tables().print(table)
-
-
 def print_rows(rows: list[dict[str, str]]) -> None:
     """Print rows with the same columns as a table; prints nothing without rows."""
     if rows:
@@ -61,7 +57,7 @@ def print_rows(rows: list[dict[str, str]]) -> None:
         for row in rows:
             # Print names literally: brackets in the name of a layer would be markup to the table.
             table.add_row(*(Text(printable(each)) for each in row.values()))
-        show(table)
+        console_of_tables().print(table)
 
 
 def print_times(milliseconds: dict[str, float]) -> None:
@@ -80,26 +76,28 @@ def warn(warnings: Iterable[str]) -> None:
         print(f"warning: {printable(warning)}", file=sys.stderr)
 
 
-def check_json(path: Path | None, inputs: Iterable[Path], out: Path | None) -> None:
+def check_json(given: Mapping[str, Any]) -> None:
     """Check before the work of a command that the file of ``--json`` can be written.
 
     Args:
-        path: path of the file.
-        inputs: files and folders that the command reads; the file must not be one of them.
-        out: folder that the command creates; the file may be inside.
+        given: arguments of the command, ``json`` among them. It writes to ``out``, which it may create, and the file
+            may be inside; all other paths are read.
 
     Raises:
         InputError: it cannot be written, or the command reads it.
     """
-    if path is None:
-        return
+    path, out = given["json"], given.get("out")
     # Imported here because it loads the reader of images, which not every command needs.
     from mcdenoise.data.files import check_writable
 
+    values = [value for name, value in given.items() if name not in ("json", "out")]
+    # Groups of options contain paths too.
+    values += [each for group in values if is_dataclass(group) for each in vars(group).values()]
+    inputs = [each for value in values for each in (value if isinstance(value, list | tuple) else [value])]
     real = os.path.realpath(path)
-    for given in map(os.path.realpath, inputs):
+    for source in (os.path.realpath(each) for each in inputs if isinstance(each, Path)):
         read = real.endswith("camera.json") or not real.endswith(".json")
-        if real == given or (os.path.lexists(real) and read and real.startswith(f"{given}{os.sep}")):
+        if real == source or (os.path.lexists(real) and read and real.startswith(f"{source}{os.sep}")):
             raise InputError(f"--json: expected a file to write, found {path}, which is an input; choose another path")
     made = out is not None and not os.path.lexists(out) and real.startswith(f"{os.path.realpath(out)}{os.sep}")
     if not made:

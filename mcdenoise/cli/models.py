@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from rich.markup import escape
-from rich.table import Column, Table
-
 from mcdenoise.cli._options import Flag, Json
-from mcdenoise.cli._output import console_of_tables, print_rows, show, warn, write_json
+from mcdenoise.cli._output import console_of_tables, print_rows, warn, write_json
 from mcdenoise.models._overview import ModelOverview, overview
 from mcdenoise.models._registry import troubles
 
@@ -45,11 +42,8 @@ def models(all: Flag = False, ops: Flag = False, json: Json = None) -> None:
     hidden = _ONLY_WIDE if console_of_tables().width < _WIDE else set()
     for kind in dict.fromkeys(entry.kind for entry in entries):
         rows = [_row(entry) for entry in entries if entry.kind == kind]
-        headers = (Column(name, no_wrap=name == "model", overflow="fold") for name in rows[0] if name not in hidden)
-        table = Table(*headers, title=kind, title_justify="left")
-        for row in rows:
-            table.add_row(*(cell for name, cell in row.items() if name not in hidden))
-        show(table)
+        print(kind)
+        print_rows([{name: cell for name, cell in row.items() if name not in hidden} for row in rows])
     print(_WEIGHTS if all else "`mcdenoise models --all` also lists the methods to compare with")
     if hidden:
         print(f"not shown, for lack of width (see --json): {', '.join(sorted(hidden))}")
@@ -68,7 +62,7 @@ def _row(entry: ModelOverview) -> dict[str, str]:
         "weights": "not available" if entry.reason else entry.weights if entry.weights != "none" else "-",
         "parameters": f"{entry.parameters:,}" if entry.parameters else "-",
         "kMAC per pixel": "-" if entry.kmacs_per_pixel is None else f"{entry.kmacs_per_pixel:.1f}",
-        "description": escape(entry.reason or entry.description),
+        "description": entry.reason or entry.description,
     }
 
 
