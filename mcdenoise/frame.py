@@ -16,7 +16,6 @@ from mcdenoise.arrays import of_array, unmasked
 from mcdenoise.buffers import (
     BUFFERS,
     LAYOUTS,
-    MATRIX,
     MOTION,
     RADIANCE,
     BufferSpec,
@@ -277,12 +276,8 @@ class Frame:
 
     def crop(self, rows: slice, columns: slice) -> Frame:
         """A rectangle of the frame, as views; its statistics stay those of the whole image, and nothing is skipped."""
-        cropped: dict[str, Any] = {
-            name: value[..., rows, columns] for name, value in self.items() if name in _NAMES and name != MATRIX
-        }
-        extra = {name: value[..., rows, columns] for name, value in self.extra.items()}
-        layers = {name: value[..., rows, columns] for name, value in self.layers.items()}
-        return replace(self, **cropped, extra=extra, layers=layers, skip=None)
+        images = replace(self, view_projection=None, skip=None).map(lambda value: value[..., rows, columns])
+        return replace(images, view_projection=self.view_projection)
 
     def with_depth(self) -> Frame:
         """The frame with a depth computed from positions and a camera (clip w), if it has these but no depth."""
