@@ -10,7 +10,7 @@ import pytest
 import torch
 from commands import succeeds
 from refusals import refused
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, create_model, ops
 from mcdenoise.data import read_exr
@@ -134,25 +134,6 @@ def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(mod
             scale = torch.ones((), requires_grad=True)
             (image * scale).mean().backward()
             torch.testing.assert_close(scale.grad, image.mean())
-
-
-def test_a_network_that_fails_leaves_the_history_unchanged() -> None:
-    shot = [SHOTS["motion vectors"](number) for number in range(FRAMES)]
-    expected, model = denoised(shot), create_model(MODEL, pretrained=True)
-    denoiser, fails = Denoiser(model), False
-
-    def fail(module: nn.Module, result: object) -> None:
-        if fails:
-            raise RuntimeError("out of memory")
-
-    model.register_forward_pre_hook(fail)
-    for frame, image in zip(shot, expected, strict=True):
-        fails = True
-        for _ in range(2):
-            with pytest.raises(RuntimeError):
-                denoiser(frame)
-        fails = False
-        assert torch.equal(denoiser(frame), image)
 
 
 def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame]) -> None:
