@@ -65,7 +65,6 @@ def run_demo(
     out: Path,
     *,
     model: str = DEFAULT,
-    variant: str | None = "scalar_rgb",
     on_render: Callable[[int, int], None] = lambda done, total: None,
     on_frame: Callable[[], None] = lambda: None,
     on_compare: Callable[[int, int], None] = lambda done, total: None,
@@ -77,7 +76,6 @@ def run_demo(
     Args:
         out: folder to write to: ``sequence/``, ``denoised/``, ``demo.png`` and ``report/``.
         model: see :func:`mcdenoise.methods.parse_method`.
-        variant: of Mitsuba; ``"scalar_rgb"`` needs nothing but its package.
         on_render: called with finished and total paths a pixel.
         on_frame: called after each denoised frame.
         on_compare: called with finished and all steps of the comparison that is reported.
@@ -97,7 +95,8 @@ def run_demo(
         size=SIZE,
         reference_spp=REFERENCE_SPP,
         reference_frames=REFERENCE_FRAMES,
-        variant=variant,
+        # It needs nothing but Mitsuba's package.
+        variant="scalar_rgb",
         progress=on_render,
     )
     sequence = open_sequence(out / "sequence")

@@ -30,6 +30,8 @@ SUFFIXES = (".onnx", ".pt2")
 _SIZE, _OTHER_SIZE, _BATCH, _OTHER_BATCH = (61, 91), (54, 77), 2, 3
 # The motion carries the same information as cameras and positions.
 _CAMERA = frozenset({"position", "previous_position", "view_projection"})
+# Number of frames on which a graph is compared with torch.
+_COMPARED = 5
 # The order of sums differs in accumulation, so results differ by rounding, see `Exported.check`.
 _NO_HISTORY_TOLERANCE = 1e-3
 
@@ -211,14 +213,13 @@ def export_model(
     return Exported(path, inputs, outputs, len(program.graph.nodes))
 
 
-def differences(exported: Exported, model: Model, sequence: Sequence, frames: int = 5) -> Iterator[tuple[int, float]]:
-    """Compare onnxruntime running an exported graph with torch running the method, over the frames of a shot.
+def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterator[tuple[int, float]]:
+    """Compare onnxruntime running an exported graph with torch running the method, over the first five frames of a shot.
 
     Args:
         exported: result of :func:`export_model`, in ONNX.
         model: the method.
         sequence: frames with the buffers that the graph takes.
-        frames: number of frames to compare.
 
     Yields:
         Number of each frame, and the largest difference of a pixel, relative to the pixel or to the image's mean,
@@ -241,7 +242,7 @@ def differences(exported: Exported, model: Model, sequence: Sequence, frames: in
     denoiser = Denoiser(model, precision="float32", keep_all=True)
     step = Step(denoiser.model, names)
     state: dict[str, Any] = {}
-    for number in sequence.numbers[:frames]:
+    for number in sequence.numbers[:_COMPARED]:
         frame = sequence.frame(number, reference=False).to(torch.float32).validate()[0].with_depth()
         given = {name: buffer for name, buffer in frame.items() if name in names}
         expected = denoiser(step.frame(given))

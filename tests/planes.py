@@ -1,7 +1,10 @@
 """Planes, the simplest surfaces: their features are known at every point of a pixel."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from mcdenoise.frame import Frame
 
@@ -19,6 +22,47 @@ def plane(offsets: Tensor | None = None) -> Frame:
     inverse = 0.2 + 0.004 * (columns + across) + 0.003 * (rows + down)
     normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
     return Frame(torch.rand(1, 3, HEIGHT, WIDTH), normal=normal, depth=(1 / inverse)[None, None])
+
+
+def leaning_wall(number: int, width: int, height: int, step: float = 1.0) -> dict[str, Tensor]:
+    """Features of a wall whose depths and positions differ from pixel to pixel, and its camera, which moves along it.
+
+    Args:
+        number: of the frame.
+        width: in pixels.
+        height: in pixels.
+        step: how far the camera moves from frame to frame; 0 before a still wall.
+    """
+    eye = torch.tensor([0.03, 0.02, 0.0]) * number * step
+    rows, columns = torch.arange(height).float(), torch.arange(width).float()
+    ray = torch.ones(3, height, width)
+    ray[0], ray[1] = (2 * columns + 1) / width - 1, ((2 * rows[:, None] + 1) / height - 1) * height / width
+    depth = 4 / (1 + 0.2 * ray[0])
+    position = eye[:, None, None] + ray * depth
+    matrix = torch.zeros(1, 4, 4)
+    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2], matrix[:, 2, 3] = 1, width / height, 1, 1
+    matrix[:, 3, :3] = -torch.stack([eye[0], eye[1] * width / height, torch.tensor(0.1)])
+    normal = torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width) / 1.04**0.5
+    features = {"albedo": 0.3 + 0.4 * (position - position.floor())[None], "normal": normal}
+    return features | {"depth": depth[None, None], "position": position[None], "view_projection": matrix}
+
+
+def random_shot(seed: int, height: int, width: int, frames: int) -> list[Frame]:
+    """Frames with random values in every buffer, that move by a motion of their seed."""
+    g = torch.Generator().manual_seed(seed)
+
+    def images(channels: int) -> Tensor:
+        return torch.rand(1, channels, height, width, generator=g)
+
+    still: dict[str, Any] = {
+        "albedo": images(3),
+        "normal": functional.normalize(images(3) - 0.5),
+        "depth": 1 + images(1),
+        "position": images(3),
+        "motion": torch.full((1, 2, height, width), 5.0 * seed),
+        "view_projection": torch.eye(4)[None] + 0.01 * seed,
+    }
+    return [Frame(color=images(3), **still) for _ in range(frames)]
 
 
 def synthetic(width: int, height: int, seed: int = 0) -> Frame:

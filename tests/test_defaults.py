@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from planes import random_shot
 from refusals import refused
 from torch import Tensor, nn
 
@@ -16,7 +17,6 @@ from mcdenoise.models import describe_weights
 from mcdenoise.models._registry import find_model
 
 DEFAULTS = ["float64", "meta"]
-HEIGHT, WIDTH = 40, 48
 
 
 @contextmanager
@@ -33,24 +33,6 @@ def default(name: str) -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
-def shot(count: int = 2, **size: int) -> list[Frame]:
-    def images(channels: int) -> Tensor:
-        return torch.rand(1, channels, size.get("height", HEIGHT), size.get("width", WIDTH))
-
-    return [
-        Frame(
-            color=images(3),
-            albedo=images(3),
-            normal=nn.functional.normalize(images(3) - 0.5),
-            depth=1 + images(1),
-            motion=images(2) - 0.5,
-            position=images(3),
-            view_projection=torch.eye(4)[None],
-        )
-        for _ in range(count)
-    ]
-
-
 def denoised(name: str, frames: list[Frame]) -> list[Tensor]:
     denoiser = Denoiser(name, precision="float32")
     return [denoiser(frame) for frame in frames]
@@ -58,7 +40,7 @@ def denoised(name: str, frames: list[Frame]) -> list[Tensor]:
 
 @pytest.mark.parametrize("model", [name for name in list_models() if find_model(name).installed])
 def test_a_model_is_made_and_denoises_alike(model: str) -> None:
-    frames = shot()
+    frames = random_shot(0, 40, 48, 2)
     try:
         expected = denoised(model, frames)
     except InputError as error:
@@ -73,7 +55,7 @@ def test_a_model_is_made_and_denoises_alike(model: str) -> None:
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_compiled_kernels_denoise_alike(name: str) -> None:
     pytest.importorskip("numba")
-    frames = shot(height=90, width=120)
+    frames = random_shot(0, 90, 120, 2)
     with ops.use("numba", strict=False):
         expected = denoised("wild_small", frames)
         with default(name):
@@ -133,8 +115,8 @@ def test_weights_of_too_many_digits_are_told(small_sequence: Path) -> None:
     model = nn.Sequential(network)
     model.forward = lambda color: network(color)  # type: ignore[method-assign]
     with pytest.raises(InputError, match=r"model:"):
-        Denoiser(model)(shot(1)[0])
-    assert Denoiser(model.float())(shot(1)[0]).dtype == torch.float32
+        Denoiser(model)(random_shot(0, 40, 48, 1)[0])
+    assert Denoiser(model.float())(random_shot(0, 40, 48, 1)[0]).dtype == torch.float32
 
 
 # Arguments of another kind

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-import torch.nn.functional as F
+from planes import random_shot
 from reads import without_reads
 from torch import Tensor
 
@@ -23,22 +23,8 @@ METHODS = ["svgf", "wild_small", "bmfr"]
 
 
 def shot(seed: int, height: int = 80, width: int = 112, frames: int = 3) -> list[Frame]:
-    """A few frames, large enough for compiled kernels."""
-    g = torch.Generator().manual_seed(seed)
-
-    def images(channels: int) -> Tensor:
-        return torch.rand(1, channels, height, width, generator=g)
-
-    still: dict[str, Any] = {
-        "albedo": images(3),
-        "normal": F.normalize(images(3) - 0.5),
-        "depth": 1 + images(1),
-        "position": images(3),
-    }
-    # Every shot moves by itself, so that its reports differ from those of others.
-    motion = torch.full((1, 2, height, width), 5.0 * seed)
-    matrix = torch.eye(4)[None] + 0.01 * seed
-    return [Frame(color=images(3), motion=motion, view_projection=matrix, **still) for _ in range(frames)]
+    """A few frames, large enough for compiled kernels. Each shot moves by itself, so that reports differ."""
+    return random_shot(seed, height, width, frames)
 
 
 def denoised(method: str, frames: list[Frame]) -> list[tuple[Tensor, Any]]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from commands import succeeds
+from planes import leaning_wall
 from refusals import refused
 from torch import Tensor
 
@@ -23,28 +24,10 @@ HEIGHT, WIDTH = 40, 72
 
 def scene(number: int, *, still: bool = False, without: tuple[str, ...] = (), sky: bool = False) -> Frame:
     """A wall that a camera moves along, or stands before; noise in the left half only, so that tiles converge."""
-    g = torch.Generator().manual_seed(number)
-    eye = torch.tensor([0.0 if still else 0.03 * number, 0.0 if still else 0.02 * number, 0.0])
-    rows, columns = (torch.arange(n).float() for n in (HEIGHT, WIDTH))
-    ray = torch.ones(3, HEIGHT, WIDTH)
-    ray[0], ray[1] = (2 * columns + 1) / WIDTH - 1, ((2 * rows[:, None] + 1) / HEIGHT - 1) * HEIGHT / WIDTH
-    # The wall leans, so that depths and positions differ from pixel to pixel.
-    depth = 4 / (1 + 0.2 * ray[0])
-    position = eye[:, None, None] + ray * depth
-    albedo = 0.3 + 0.4 * (position - position.floor())
-    noise = torch.rand(1, 3, HEIGHT, WIDTH, generator=g)
-    color = albedo * torch.where(columns < 36, 2 * noise, 1 + 0.001 * (noise - 0.5))
-    matrix = torch.zeros(1, 4, 4)
-    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2], matrix[:, 2, 3] = 1, WIDTH / HEIGHT, 1, 1
-    matrix[:, 3, :3] = -torch.stack([eye[0], eye[1] * WIDTH / HEIGHT, torch.tensor(0.1)])
-    frame = Frame(
-        color=color,
-        albedo=albedo[None],
-        normal=torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH) / 1.04**0.5,
-        depth=depth[None, None],
-        position=position[None],
-        view_projection=matrix,
-    )
+    wall = leaning_wall(number, WIDTH, HEIGHT, step=0.0 if still else 1.0)
+    noise = torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(number))
+    color = wall["albedo"] * torch.where(torch.arange(WIDTH) < 36, 2 * noise, 1 + 0.001 * (noise - 0.5))
+    frame = Frame(color=color, **wall)
     if sky:
         frame = frame.replace(depth=torch.full((1, 1, HEIGHT, WIDTH), torch.inf), color=torch.ones_like(color))
     return frame.replace(**dict.fromkeys(without))

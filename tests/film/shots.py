@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from planes import leaning_wall
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, write_exr
@@ -45,7 +46,8 @@ class Inline:
 def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:
     """Frames of one shot, in the BMFR layout."""
     inputs = folder / "inputs"
-    matrices = np.stack([_matrix(number, width, height) for number in range(frames)])
+    walls = [leaning_wall(number, width, height) for number in range(frames)]
+    matrices = np.concatenate([wall["view_projection"].double().numpy() for wall in walls])
     for number in range(frames):
         write_bmfr_frame(inputs, number, frame(number, width, height, seed))
     cameras = CameraMatrices(matrices, np.full((frames, 2), 0.5), 0.01, 0.25)
@@ -53,33 +55,14 @@ def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, 
     return folder
 
 
-def _matrix(number: int, width: int, height: int) -> np.ndarray:
-    matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[1, 1], matrix[2, 2], matrix[2, 3] = 1, width / height, 1, 1
-    eye = _eye(number)
-    matrix[3, :3] = -np.array([eye[0], eye[1] * width / height, 0.1])
-    return matrix
-
-
-def _eye(number: int) -> np.ndarray:
-    return np.array([0.03 * number, 0.02 * number, 0.0])
-
-
 def frame(number: int, width: int, height: int, seed: int) -> Frame:
     """One sample a pixel of a leaning wall: noise as of a lucky path, of mean 1."""
     generator = torch.Generator().manual_seed(seed * 100_003 + number)
-    eye = torch.from_numpy(_eye(number)).float()
-    rows, columns = torch.arange(height).float(), torch.arange(width).float()
-    ray = torch.ones(3, height, width)
-    ray[0], ray[1] = (2 * columns + 1) / width - 1, ((2 * rows[:, None] + 1) / height - 1) * height / width
-    depth = 4 / (1 + 0.2 * ray[0])
-    position = eye[:, None, None] + ray * depth
-    albedo = 0.3 + 0.4 * (position - position.floor())
     noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
-    normal = torch.tensor([-0.2, 0.0, -1.0]).reshape(1, 3, 1, 1).expand(1, 3, height, width) / 1.04**0.5
-    return Frame(
-        color=albedo * noise, albedo=albedo[None], normal=normal, depth=depth[None, None], position=position[None]
-    )
+    wall = leaning_wall(number, width, height)
+    # The camera has a file of its own.
+    del wall["view_projection"]
+    return Frame(wall["albedo"] * noise, **wall)
 
 
 def write_manifest(path: Path, shots: dict[str, Path], **every: object) -> Path:
