@@ -61,16 +61,11 @@ class Skip(NamedTuple):
 
     Args:
         mask: ``(B, 1, H, W)`` bool, true where the result is known.
-        images: ``(B, 3, H, W)`` results by stage; ``"image"`` is the final one, and replaces missing stages. They are
-            finite everywhere and used where ``mask`` is true.
+        image: ``(B, 3, H, W)`` that result, finite everywhere, and used where ``mask`` is true.
     """
 
     mask: Tensor
-    images: Mapping[str, Tensor]
-
-    def of(self, stage: str) -> Tensor | None:
-        """The known result of a stage."""
-        return self.images.get(stage, self.images.get("image"))
+    image: Tensor
 
 
 # eq=False: comparing tensors has no single truth value, so frames are equal only to themselves.

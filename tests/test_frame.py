@@ -115,7 +115,7 @@ def test_a_function_reaches_every_buffer() -> None:
 
 def test_a_part_of_a_frame_is_a_view_with_the_statistics_of_the_whole() -> None:
     statistics = {"exposure": torch.ones(2, 1, 1, 1)}
-    skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"image": plane(3)})
+    skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), plane(3))
     samples, crypto = torch.rand(2, 4, 3, *SIZE), torch.rand(2, 5, *SIZE)
     frame = full_frame().replace(samples=samples, extra={"crypto": crypto}, statistics=statistics, skip=skip)
     part = frame.crop(slice(1, 4), slice(2, 7))
@@ -151,7 +151,7 @@ def loaded_frame() -> Frame:
         samples=torch.rand(2, 4, 3, *SIZE),
         extra={"crypto": plane(5), "id": plane(1)},
         statistics={"exposure": torch.ones(2, 1, 1, 1)},
-        skip=Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), {"image": plane(3)}),
+        skip=Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), plane(3)),
         hints=Hints(still=True, stages=False),
     )
 

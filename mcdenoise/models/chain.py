@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from mcdenoise.frame import Frame, Skip
+from mcdenoise.frame import Frame
 from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._layers import completed
@@ -66,14 +65,10 @@ class Chain(nn.Module):
         last, skip = self._names[-1], frame.skip
         for name in self._names:
             method: Model = getattr(self, name)
-            known = None if skip is None else skip.of("image" if name == last else name)
-            part = None if skip is None else Skip(skip.mask, {} if known is None else {"image": known})
             # In a tile, the first method has been given the statistics of the whole image.
             frame = frame if name == self._names[0] and frame.statistics else prepared(method, frame)
-            output, states[name] = method(frame.replace(skip=part), states[name])
-            if skip is not None and known is not None:
-                image = torch.where(skip.mask, known.to(output.image.dtype), output.image)
-                output = output._replace(image=image)
+            # Only of the last image something is known; it is computed from all pixels of the one before.
+            output, states[name] = method(frame.replace(skip=skip if name == last else None), states[name])
             output = completed(frame, output)
             image = output.image
             notes += output.notes

@@ -41,8 +41,6 @@ def scaled(frame: Frame, factor: Tensor) -> Frame:
     light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
     samples = None if frame.samples is None else scale_samples(frame.samples, factor)
     variance = None if frame.variance is None else frame.variance * factor.square()
-    skip = frame.skip
-    if skip is not None:
-        skip = Skip(skip.mask, {name: image * factor for name, image in skip.images.items()})
+    skip = None if frame.skip is None else Skip(frame.skip.mask, frame.skip.image * factor)
     layers = {name: layer * factor for name, layer in frame.layers.items()}
     return frame.replace(**light, samples=samples, variance=variance, layers=layers, skip=skip)

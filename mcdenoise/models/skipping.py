@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -44,7 +43,7 @@ class Remembered(NamedTuple):
     """State while nothing moves.
 
     Args:
-        images: results by stage, ``"image"`` last, ``(B, 3, H, W)``.
+        image: ``(B, 3, H, W)`` the result; ``None`` until it is computed.
         color: ``(B, 3, H, W)`` radiance from which each tile was computed.
         weight: ``(B, 1, H, W)`` weight of the current frame in it: one over the history length.
         passed: ``(B, 1, h, w)`` bool, tiles whose accumulated image was passed through; equal for all images of a
@@ -53,7 +52,7 @@ class Remembered(NamedTuple):
         marks: means of the features over each tile, which identify its content; ``None`` until they are needed.
     """
 
-    images: Mapping[str, Tensor]
+    image: Tensor | None
     color: Tensor
     weight: Tensor
     passed: Tensor
@@ -73,7 +72,7 @@ class Skipping(Wrapper):
     the color does not.
 
     Args:
-        inner: a method. :class:`mcdenoise.models.Tiled`, or a chain of tiled methods, computes only the remaining
+        inner: a method. :class:`mcdenoise.models.Tiled`, also as the last one of a chain, computes only the remaining
             tiles.
         tolerance: largest noise (root mean square, relative to the tile's mean) of a tile that is passed through, and
             largest relative change of a tile that is reused; 0 computes every tile that has noise.
@@ -104,11 +103,11 @@ class Skipping(Wrapper):
         passed = None if kept is None else _pixels(kept.passed, frame.size)
         reused = None if kept is None else _pixels(kept.reused, frame.size)
         none = "layers or alpha are asked for" if still and carries else "there are none"
-        images = {} if before is None else before.images
-        skip = _skip(free, passed, reused, current, frame.color, images)
+        result = None if before is None else before.image
+        skip = _skip(free, passed, reused, current, frame.color, result)
         output, inner = self.inner(frame.replace(skip=skip), inner)
         if skip is not None:
-            image = torch.where(skip.mask, skip.images["image"].to(output.image.dtype), output.image)
+            image = torch.where(skip.mask, skip.image.to(output.image.dtype), output.image)
             output = completed(frame, output._replace(image=image))
         output = output.noted(
             _note("noise-free pixels", free, "background and emitters are copied", exact=True),
@@ -118,21 +117,21 @@ class Skipping(Wrapper):
         if frame.hints.last:
             kept = None
         elif kept is not None:
-            kept = kept._replace(images={**output.stages, "image": output.image})
+            kept = kept._replace(image=output.image)
         return output, None if kept is None and inner is None else (kept, inner)
 
     def _decided(self, frame: Frame, current: Tensor, before: Remembered | None) -> Remembered:
-        """The state after this frame, without its images: it holds the tiles that are not computed."""
+        """The state after this frame, without its image: it holds the tiles that are not computed."""
         length = torch.ones_like(frame.color[:, :1]) if frame.length is None else frame.length
         passed = self._converged(frame.color, current, length, None if before is None else before.passed)
         weight = 1 / length
         if before is None:
-            return Remembered({}, frame.color, weight, passed, torch.zeros_like(passed), None)
+            return Remembered(None, frame.color, weight, passed, torch.zeros_like(passed), None)
         reused, marks = self._unchanged(frame, weight, before)
         reused = reused & ~passed
         pixels = _pixels(reused, frame.size)
         color, weight = torch.where(pixels, before.color, frame.color), torch.where(pixels, before.weight, weight)
-        return Remembered({}, color, weight, passed, reused, marks)
+        return Remembered(None, color, weight, passed, reused, marks)
 
     def _converged(self, color: Tensor, current: Tensor, length: Tensor, before: Tensor | None) -> Tensor:
         """Tiles whose estimated noise is below the tolerance.
@@ -186,16 +185,14 @@ def _skip(
     reused: Tensor | None,
     current: Tensor,
     color: Tensor,
-    images: Mapping[str, Tensor],
+    result: Tensor | None,
 ) -> Skip | None:
     """Pixels with a known result, and that result: the previous one, the accumulated radiance, or the frame's color."""
     if passed is None or reused is None or not (passed.any() or reused.any()):
-        return None if free is None else Skip(free, {"image": current})
-    known = {name: torch.where(passed, color, image) for name, image in (images or {"image": color}).items()}
+        return None if free is None else Skip(free, current)
+    known = color if result is None else torch.where(passed, color, result)
     mask = (passed | reused).expand_as(current[:, :1])
-    if free is None:
-        return Skip(mask, known)
-    return Skip(mask | free, {name: torch.where(free, current, image) for name, image in known.items()})
+    return Skip(mask, known) if free is None else Skip(mask | free, torch.where(free, current, known))
 
 
 def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are none", *, exact: bool) -> Note:

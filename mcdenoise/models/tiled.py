@@ -121,20 +121,13 @@ def without_border(image: Tensor, width: int = MIRRORED) -> Tensor:
 
 
 def _known(frame: Frame, output: Output) -> Output:
-    """Images of the whole frame for an output of a tile: the values of pixels that are not computed.
-
-    They are the known result, or the input.
-    """
-
-    def known(stage: str, like: Tensor) -> Tensor:
-        found = None if frame.skip is None else frame.skip.of(stage)
-        return (frame.color if found is None else found).to(like.dtype, copy=True)
-
-    stages = {name: known(name, image) for name, image in output.stages.items()}
+    """Images of the whole frame for an output of a tile: in pixels that are not computed the known result."""
+    known = frame.color if frame.skip is None else frame.skip.image
+    stages = {name: known.to(image.dtype, copy=True) for name, image in output.stages.items()}
     layers = {name: frame.layers[name].to(layer.dtype, copy=True) for name, layer in output.layers.items()}
     before = frame.color[:, :1] if frame.alpha is None else frame.alpha
     alpha = None if output.alpha is None else before.to(output.alpha.dtype, copy=True)
-    return Output(known("image", output.image), stages, layers, alpha, output.notes)
+    return Output(known.to(output.image.dtype, copy=True), stages, layers, alpha, output.notes)
 
 
 def _images(output: Output) -> list[Tensor]:

@@ -13,7 +13,7 @@ from torch.utils import _pytree as pytree
 from toys import Blur, Mean, Same, Shot, Watching, cascade, report_of, small
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import Accumulated, Chain, Demodulated, Output, Skipping, Tiled
+from mcdenoise.models import Accumulated, Demodulated, Output, Skipping, Tiled
 from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._report import FrameReport, Stage, summarize
 from mcdenoise.models._wrapper import parts_of
@@ -383,17 +383,6 @@ def test_reused_and_passed_tiles_of_a_toy_are_not_computed() -> None:
     assert report.stages["network"].skipped == 1
     assert toy.pixels == 15 * HEIGHT * WIDTH
     assert torch.equal(outputs[-1].image, outputs[14].image)
-
-
-def test_stages_are_reused_with_the_image() -> None:
-    model = Accumulated(Skipping(Chain(initial=Tiled(Blur()), final=Tiled(Blur()))))
-    outputs, report = shot_of(model, [wall(0).replace(albedo=None)] * 20)
-    assert report.stages["network"].skipped == 1
-    assert list(outputs[-1].stages) == ["accumulated", "initial"]
-    for one, other in zip(outputs[-1].stages.values(), outputs[14].stages.values(), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=0)
-    expected, _ = Blur()(wall(0).replace(albedo=None, color=outputs[-1].stages["accumulated"]))
-    torch.testing.assert_close(outputs[-1].stages["initial"], expected.image)
 
 
 def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:

@@ -211,7 +211,7 @@ def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
         **parts,
         samples=samples,
         current=frame.color / 2,
-        skip=Skip(torch.zeros(1, 1, 20, 24, dtype=torch.bool), {"image": 3 * frame.color}),
+        skip=Skip(torch.zeros(1, 1, 20, 24, dtype=torch.bool), 3 * frame.color),
     )
     Exposed(watching)(frame)
     seen, exposure = watching.frames[0], auto_exposure(frame.color)
@@ -224,7 +224,7 @@ def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
     torch.testing.assert_close(seen.samples[:, 0, :3], frame.color * exposure)
     assert torch.equal(seen.samples[:, 0, 3:], torch.ones(1, 2, 20, 24))
     assert seen.skip is not None
-    torch.testing.assert_close(seen.skip.images["image"], 3 * frame.color * exposure)
+    torch.testing.assert_close(seen.skip.image, 3 * frame.color * exposure)
 
 
 # Chain
@@ -281,16 +281,11 @@ def test_statistics_are_those_of_the_accumulated_image() -> None:
     assert prepared(model, frame).statistics == {}
 
 
-def test_known_pixels_of_each_stage_are_kept() -> None:
-    frame = frame_of(9, 7)
-    mask = torch.rand(1, 1, 9, 7) > 0.5
-    known = {"first": torch.full_like(frame.color, 5.0), "image": torch.full_like(frame.color, 9.0)}
-    output, _ = Chain(first=double, second=double)(frame.replace(skip=Skip(mask, known)))
-    assert torch.equal(output.stages["first"], torch.where(mask, 5, 2 * frame.color))
-    assert torch.equal(output.image, torch.where(mask, 9, 4 * frame.color))
-    # The last result stands for stages of which nothing is known.
-    output, _ = Chain(first=double, second=double)(frame.replace(skip=Skip(mask, {"image": known["image"]})))
-    assert torch.equal(output.stages["first"], torch.where(mask, 9, 2 * frame.color))
+def test_pixels_are_known_of_the_last_image_only() -> None:
+    frame, watching = frame_of(9, 7), Watching()
+    skip = Skip(torch.rand(1, 1, 9, 7) > 0.5, torch.full_like(frame.color, 9.0))
+    Chain(first=watching, second=watching)(frame.replace(skip=skip))
+    assert [each.skip for each in watching.frames] == [None, skip]
 
 
 def test_a_chain_of_nothing_is_refused() -> None:
