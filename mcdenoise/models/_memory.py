@@ -30,8 +30,6 @@ _GPU_FRACTION = 0.4
 # freed pieces.
 _LOADED_LATER = 0.45 * GB
 _BYTES = 4
-# Kinds of frames whose tiles are remembered: sizes may be ever new ones.
-_TILINGS = 16
 # Channels of a history: a long and a recent one, the moments by which they are compared, and the length.
 _KEPT = 10
 # Channels of a layer, measured: as given, without albedo, two histories of six, each scale, and temporary results.
@@ -41,25 +39,14 @@ _SURFACE = ("position", "normal", "depth")
 _STATM = Path("/proc/self/statm")
 
 
-class Tiling(NamedTuple):
-    """The parts of an image on which a network runs.
-
-    Args:
-        side: longest side in pixels; ``None`` for the whole image at once.
-        reason: why, in words.
-    """
-
-    side: int | None
-    reason: str
-
-
 class Division:
     """How a model's images are divided into tiles.
 
     Args:
         model: any method; whole images are computed unless it contains :class:`mcdenoise.models.Tiled`.
         side: of the tiles in pixels, a multiple of 32 from 64 on; by default as memory allows.
-        max_memory: in GB, see :class:`mcdenoise.denoiser.Denoiser`.
+        max_memory: in GB, of the whole process (of the device, where that is no CPU), see
+            :class:`mcdenoise.denoiser.Denoiser`.
         device: where the model runs.
 
     Raises:
@@ -68,15 +55,19 @@ class Division:
 
     def __init__(self, model: Model, side: int | None, max_memory: float | None, device: torch.device) -> None:
         self._tiled = [tiled for tiled in parts_of(model, Tiled) if tiled.halo is not None]
-        if side is not None:
-            check_side(side)
-            if max_memory is not None:
-                raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
-        self._memory = Memory(None if max_memory is None else max_memory * GB, device)
+        if side is not None and (side < LEAST_SIDE or side % MULTIPLE):
+            raise InputError(f"tile: expected a multiple of {MULTIPLE} of at least {LEAST_SIDE} pixels, found {side}")
+        if side is not None and max_memory is not None:
+            raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
+        if max_memory is not None and not 0 < max_memory < math.inf:
+            raise InputError(f"max_memory: expected a number of GB above 0, found {max_memory:g}")
         if not self._tiled and (side, max_memory) != (None, None):
             raise InputError("tile, max_memory: expected a model that computes tiles of an image, found one without")
-        self._side = side
-        self._tilings: dict[Frames, Tiling] = {}
+        self._side, self._device = side, device
+        self._cap = None if max_memory is None else max_memory * GB
+        self._loaded = _memory_in_use(device)
+        self._halo = max((tiled.halo or 0 for tiled in self._tiled), default=0)
+        self._last: tuple[Frames, tuple[int | None, str]] | None = None
 
     def divide(self, frames: Frames) -> str:
         """Choose the tiles of the next frame; says which, and why.
@@ -86,62 +77,27 @@ class Division:
         """
         if not self._tiled:
             return "whole frames: the model computes no tiles"
-        tiling = self._tiling(frames)
+        # The frames of a shot are alike.
+        if self._last is None or self._last[0] != frames:
+            self._last = frames, self.chosen(frames)
+        side, reason = self._last[1]
         for tiled in self._tiled:
-            tiled.side = tiling.side
-        return tiling.reason
+            tiled.side = side
+        return reason
 
     def has_room_ahead(self, frames: Frames) -> bool:
-        """Whether the next frame can be read, and the last one be written, while one is denoised.
+        """Whether the next frame can be read, and the last one be written, beside tiles that are not too small.
 
         Raises:
             InputError: not even the smallest tiles fit.
         """
-        if not self._tiled:
+        if not self._tiled or self._cap is None:
             return True
-        self._tiling(frames)
-        return self._memory.has_room_ahead(frames, self._network(frames))
+        self.chosen(frames)
+        return self._least(frames._replace(ahead=True), _WORTHWHILE_SIDE) <= self._cap
 
-    def _tiling(self, frames: Frames) -> Tiling:
-        if frames not in self._tilings:
-            if len(self._tilings) == _TILINGS:
-                self._tilings.clear()
-            if self._side is not None:
-                tiling = Tiling(self._side, f"{describe(frames.size, self._side)}: as asked for")
-            else:
-                tiling = self._memory.choose(frames, self._network(frames))
-            self._tilings[frames] = tiling
-        return self._tilings[frames]
-
-    def _network(self, frames: Frames) -> Network:
-        halo = max(tiled.halo or 0 for tiled in self._tiled)
-        return Network(halo, max(tiled.inner.needs.live.bytes(bfloat16=frames.bfloat16) for tiled in self._tiled))
-
-
-class Memory:
-    """The memory that a denoiser may take, and the memory that it takes.
-
-    Args:
-        cap: maximum of bytes of the whole process (of the device, where that is no CPU); ``None`` for no limit.
-        device: where the network runs.
-
-    Raises:
-        InputError: the cap is not a positive number.
-    """
-
-    def __init__(self, cap: float | None, device: torch.device) -> None:
-        if cap is not None and not 0 < cap < math.inf:
-            raise InputError(f"max_memory: expected a number of GB above 0, found {cap / GB:g}")
-        self.cap = cap
-        self._device = device
-        self._loaded = _memory_in_use(device)
-
-    def has_room_ahead(self, frames: Frames, network: Network) -> bool:
-        """Whether the next frame can be read, and the last one be written, beside tiles that are not too small."""
-        return self.cap is None or self._least(frames._replace(ahead=True), network, _WORTHWHILE_SIDE) <= self.cap
-
-    def choose(self, frames: Frames, network: Network) -> Tiling:
-        """The largest tiles that fit.
+    def chosen(self, frames: Frames) -> tuple[int | None, str]:
+        """The side of the largest tiles that fit, ``None`` for whole frames, and why.
 
         Without a cap, the features of a network are kept below 2 GB on a CPU, and 0.4 of the memory of a GPU.
 
@@ -149,48 +105,38 @@ class Memory:
             InputError: not even the smallest tiles fit.
         """
         height, width = frames.size
-        if self.cap is None:
+        if self._side is not None:
+            return self._side, f"{describe(frames.size, self._side)}: as asked for"
+        if self._cap is None:
             limit = _FEATURES
             if self._device.type == "cuda":
                 limit = _GPU_FRACTION * torch.cuda.get_device_properties(self._device).total_memory
             why = f"features of the network within {limit / GB:.3g} GB"
         else:
-            least = self._least(frames, network)
-            if least > self.cap:
+            least = self._least(frames, LEAST_SIDE)
+            if least > self._cap:
                 raise InputError(
                     f"max_memory: expected at least {least / GB + 0.005:.2f} GB for frames of {width}x{height}, found "
-                    f"{self.cap / GB:g}; allow that much, or take a smaller model, bfloat16 or fewer buffers"
+                    f"{self._cap / GB:g}; allow that much, or take a smaller model, bfloat16 or fewer buffers"
                 )
-            limit = self.cap - self._loaded - frames.held
-            why = f"all within {self.cap / GB:g} GB"
-
-        def fits(side: int) -> bool:
-            return frames.batch * network.bytes_per_pixel * _largest_part(frames.size, side, network.halo) <= limit
-
+            limit = self._cap - self._loaded - frames.held
+            why = f"all within {self._cap / GB:g} GB"
         side = -(-max(frames.size) // MULTIPLE) * MULTIPLE
-        if fits(side):
-            return Tiling(None, f"whole frames: {why}")
-        while side > LEAST_SIDE and not fits(side):
+        if self._features(frames, side) <= limit:
+            return None, f"whole frames: {why}"
+        while side > LEAST_SIDE and self._features(frames, side) > limit:
             side -= MULTIPLE
-        return Tiling(side, f"{describe(frames.size, side)}: {why}")
+        return side, f"{describe(frames.size, side)}: {why}"
 
-    def _least(self, frames: Frames, network: Network, side: int = LEAST_SIDE) -> float:
-        """Bytes that are needed with small tiles."""
-        part = _largest_part(frames.size, side, network.halo)
-        features = frames.batch * network.bytes_per_pixel * part
-        return self._loaded + max(frames.held + features, frames.held_elsewhere)
+    def _least(self, frames: Frames, side: int) -> float:
+        """Bytes that are needed with tiles of a side."""
+        return self._loaded + max(frames.held + self._features(frames, side), frames.held_elsewhere)
 
-
-class Network(NamedTuple):
-    """The properties of a network that its memory depends on.
-
-    Args:
-        halo: width of the margin around a tile in pixels.
-        bytes_per_pixel: memory that it takes for each pixel of a tile and its margin.
-    """
-
-    halo: int
-    bytes_per_pixel: float
+    def _features(self, frames: Frames, side: int) -> float:
+        """Bytes of a network's features for the largest tile and its margin."""
+        bytes_per_pixel = max(tiled.inner.needs.live.bytes(bfloat16=frames.bfloat16) for tiled in self._tiled)
+        tiles = Region(0, 0, *frames.size).split(side)
+        return frames.batch * bytes_per_pixel * max(tile.grown(self._halo, frames.size).pixels for tile in tiles)
 
 
 class Frames(NamedTuple):
@@ -252,12 +198,6 @@ def describe(size: tuple[int, int], side: int) -> str:
     return f"{columns} x {len(tiles) // columns} tiles of up to {tiles[0].right}x{tiles[0].bottom} pixels"
 
 
-def check_side(side: int) -> None:
-    """``InputError`` for a side that tiles cannot have."""
-    if side < LEAST_SIDE or side % MULTIPLE:
-        raise InputError(f"tile: expected a multiple of {MULTIPLE} of at least {LEAST_SIDE} pixels, found {side}")
-
-
 def _memory_in_use(device: torch.device) -> float:
     """Bytes that this process will hold on the device besides its images."""
     if device.type == "cuda":
@@ -268,8 +208,3 @@ def _memory_in_use(device: torch.device) -> float:
         # The system does not tell: as much as torch takes.
         resident = int(0.4 * GB)
     return resident + _LOADED_LATER
-
-
-def _largest_part(size: tuple[int, int], side: int, halo: int) -> int:
-    whole = Region(0, 0, *size)
-    return max(tile.grown(halo, size).pixels for tile in whole.split(side))
