@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Sequence
-from contextlib import suppress
 from typing import Any
 
 import torch
@@ -14,10 +13,9 @@ from torch.utils import _pytree as pytree
 from mcdenoise.buffers import BUFFERS, MATRIX
 from mcdenoise.errors import InputError, MissingBufferError, in_one_line
 from mcdenoise.frame import Frame
-from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._interface import Ask, Model, Needs, Output, State
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._registry import build_model, find_model, list_models
+from mcdenoise.models._registry import needs_of_models
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.own import refused
 
@@ -101,19 +99,13 @@ def check_needs(needs: Needs, given: Collection[str]) -> None:
 @functools.cache
 def _ready() -> dict[str, frozenset[str]]:
     """The needs of every method that is ready to use: one with shipped weights, or one that needs no training."""
-    found = {}
     shipped = pretrained_models()
-    # Constructing a network draws random numbers: keep the caller's generator unchanged.
-    with without_draws():
-        for name in list_models():
-            needs = None
-            # A model of an installed package may raise anything; such a model is not offered.
-            with suppress(InputError), refused(name):
-                needs = build_model(name).needs if find_model(name).installed else None
-            # A method that reads only the pixel itself does not denoise.
-            if needs is not None and needs.reach != 0 and (name in shipped or not needs.trainable):
-                found[name] = needs.buffers
-    return found
+    # A method that reads only the pixel itself does not denoise.
+    return {
+        name: needs.buffers
+        for name, needs in needs_of_models().items()
+        if needs.reach != 0 and (name in shipped or not needs.trainable)
+    }
 
 
 def owned(tree: Any, others: Any) -> Any:

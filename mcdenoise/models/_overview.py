@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any, get_args
@@ -13,9 +12,8 @@ from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._entries import Kind
-from mcdenoise.models._registry import build_model, find_model, list_models
+from mcdenoise.models._registry import build_model, find_model, list_models, needs_of_models
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.own import refused
 
@@ -68,15 +66,10 @@ def overview(pattern: str = "*") -> list[ModelOverview]:
 
 def users_of(buffers: Iterable[str]) -> dict[str, list[str]]:
     """For each given buffer, the sorted names of the models that need or use it."""
-    needs: dict[str, frozenset[str]] = {}
-    # Constructing a network draws random numbers: keep the caller's generator unchanged.
-    with without_draws():
-        for name in list_models():
-            # A model that cannot be made uses nothing.
-            with suppress(InputError), refused(name):
-                found = build_model(name).needs
-                needs[name] = found.buffers | found.uses
-    return {buffer: [name for name, own in needs.items() if buffer in own] for buffer in buffers}
+    models = needs_of_models()
+    return {
+        buffer: [name for name, needs in models.items() if buffer in needs.buffers | needs.uses] for buffer in buffers
+    }
 
 
 def _overview(name: str, weights: str) -> ModelOverview:

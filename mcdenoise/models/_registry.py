@@ -7,6 +7,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import Distribution, EntryPoint, distributions
@@ -17,9 +18,9 @@ from torch import nn
 
 from mcdenoise.errors import InputError, did_you_mean, in_one_line
 from mcdenoise.models._adapter import as_model
-from mcdenoise.models._defaults import outlined, plain_defaults
+from mcdenoise.models._defaults import outlined, plain_defaults, without_draws
 from mcdenoise.models._entries import MODELS, Entry
-from mcdenoise.models._interface import Model
+from mcdenoise.models._interface import Model, Needs
 from mcdenoise.own import load_own, refused
 
 GROUP = "mcdenoise.models"
@@ -81,6 +82,18 @@ def find_model(name: str) -> Entry:
         f"model '{name}': expected one of {', '.join(known)}, or path/to/file.py:factory, or "
         "package.module:factory; see `mcdenoise models`"
     )
+
+
+def needs_of_models() -> dict[str, Needs]:
+    """The needs of every registered model that can be made, by sorted name."""
+    found = {}
+    # Constructing a network draws random numbers: keep the caller's generator unchanged.
+    with without_draws():
+        for name in list_models():
+            # A model of an installed package may raise anything; such a model is left out.
+            with suppress(InputError), refused(name):
+                found[name] = build_model(name).needs
+    return found
 
 
 def build_model(name: str, **settings: Any) -> Model:
