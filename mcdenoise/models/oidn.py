@@ -28,7 +28,57 @@ Auxiliary = Literal["noisy", "clean", "prefiltered"]
 Source = Literal["raw", "accumulated", "demodulated", "accumulated after"]
 
 
-class Oidn(nn.Module):
+class Filters(nn.Module):
+    """Open Image Denoise's filters on frames, whatever runs them.
+
+    Args:
+        quality: see :class:`Oidn`.
+    """
+
+    def __init__(self, quality: Quality) -> None:
+        super().__init__()
+        self.quality = quality
+        # The result depends on the whole image through its exposure.
+        self.needs = Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
+
+    def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
+        """The denoised color ``(B, 3, H, W)``.
+
+        Args:
+            frame: uses color, albedo and normal.
+            auxiliary: see :class:`Oidn`.
+        """
+        if auxiliary == "prefiltered":
+            frame = self.with_clean_features(frame, "high")
+        images = {"color": frame.color, **guides_of(frame)}
+        return self.filtered(images, self.quality, clean=auxiliary != "noisy").to(frame.color.dtype)
+
+    def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
+        """The frame with denoised albedo and normal, each denoised by itself.
+
+        Args:
+            frame: any.
+            quality: of these filters; fast and balanced use the same network.
+        """
+        guides = guides_of(frame).items()
+        clean = {name: self.filtered({name: image}, quality, clean=False).to(image.dtype) for name, image in guides}
+        return frame.replace(**clean)
+
+    def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
+        """Run one filter.
+
+        Args:
+            images: ``(B, 3, H, W)`` each: color with or without features, or a single feature.
+            quality: see :class:`Oidn`.
+            clean: whether the features of a color count as clean.
+
+        Returns:
+            ``(B, 3, H, W)``: the filtered color or feature.
+        """
+        raise NotImplementedError
+
+
+class Oidn(Filters):
     """Open Image Denoise on the CPU, applied to the frame's color; device, filters and buffers are kept between frames.
 
     Filters are created when they are first needed, and again when the image size changes. There are no derivatives.
@@ -47,15 +97,13 @@ class Oidn(nn.Module):
     def __init__(
         self, quality: Quality = "high", auxiliary: Auxiliary = "noisy", *, threads: int | None = None
     ) -> None:
-        super().__init__()
-        # The result depends on the whole image through its exposure.
-        self.needs = Needs(uses=frozenset({"albedo", "normal"}), trainable=False)
+        super().__init__(quality)
         _check("quality", quality, Quality)
         _check("auxiliary", auxiliary, Auxiliary)
         if threads is not None and threads < 1:
             raise InputError(f"threads: expected at least 1, found {threads}")
         self._oidn = _import_oidn()
-        self.quality, self.auxiliary, self.threads = quality, auxiliary, threads
+        self.auxiliary, self.threads = auxiliary, threads
         self._device = self._oidn.Device()
         if threads is not None:
             self._device.set_int("numThreads", threads)
@@ -74,59 +122,19 @@ class Oidn(nn.Module):
         """See :class:`mcdenoise.models.Model`.
 
         Raises:
-            InputError, RuntimeError: see :meth:`denoised`.
+            InputError, RuntimeError: see :meth:`filtered`.
         """
         return Output(self.denoised(frame, self.auxiliary)), None
 
-    def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
-        """The denoised color ``(B, 3, H, W)``.
-
-        Args:
-            frame: uses color, albedo and normal.
-            auxiliary: in place of that of the object.
+    def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
+        """Run the library's filter, one image of the batch at a time, in float32; see :meth:`Filters.filtered`.
 
         Raises:
             InputError: a derivative in the color is requested; it would silently be zero.
             RuntimeError: the library reports an error; the message is the library's.
         """
-        if torch.is_grad_enabled() and frame.color.requires_grad:
+        if torch.is_grad_enabled() and "color" in images and images["color"].requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
-        if auxiliary == "prefiltered":
-            frame = self.with_clean_features(frame, "high")
-        with torch.no_grad():
-            image = self.filtered({"color": frame.color, **guides_of(frame)}, self.quality, clean=auxiliary != "noisy")
-        return image.to(frame.color.dtype)
-
-    def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
-        """The frame with denoised albedo and normal, each denoised by itself.
-
-        Args:
-            frame: any.
-            quality: of these filters; fast and balanced use the same network.
-
-        Raises:
-            RuntimeError: the library reports an error; the message is the library's.
-        """
-        with torch.no_grad():
-            clean = {
-                name: self.filtered({name: image}, quality, clean=False) for name, image in guides_of(frame).items()
-            }
-        return frame.replace(**{name: image.to(getattr(frame, name).dtype) for name, image in clean.items()})
-
-    def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
-        """Run the library's filter, one image of the batch at a time.
-
-        Args:
-            images: ``(B, 3, H, W)`` each: color with or without features, or a single feature.
-            quality: see the class.
-            clean: whether the features of a color count as clean.
-
-        Returns:
-            ``(B, 3, H, W)`` float32: the filtered color or feature.
-
-        Raises:
-            RuntimeError: the library reports an error; the message is the library's.
-        """
         first = next(iter(images.values()))
         batch, _, height, width = first.shape
         self._resize(height, width)
@@ -134,7 +142,7 @@ class Oidn(nn.Module):
         results = []
         for index in range(batch):
             for name, image in images.items():
-                self._images[name].copy_(image[index].permute(1, 2, 0))
+                self._images[name].copy_(image[index].detach().permute(1, 2, 0))
             denoiser.execute()
             self._check_device()
             results.append(self._images["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())

@@ -21,7 +21,7 @@ from mcdenoise.models._contract import check_needs
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._tza import Archive, archives_in, read_tza
-from mcdenoise.models.oidn import Auxiliary, Oidn, Quality, guides_of, library_of_oidn
+from mcdenoise.models.oidn import Auxiliary, Filters, Oidn, Quality, library_of_oidn
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
@@ -106,8 +106,8 @@ class FeatureFilter(nn.Module):
         return clean.to(image.dtype)
 
 
-class OpenFilters(nn.Module):
-    """The library's filters in torch, with the methods of :class:`mcdenoise.models.oidn.Oidn` that other methods call.
+class OpenFilters(Filters):
+    """The library's filters in torch.
 
     They take half the time in bfloat16 where a processor has it. Their weights are the library's and are not part of a
     method's own. Networks for frames without features are made when they are first needed.
@@ -121,9 +121,7 @@ class OpenFilters(nn.Module):
     """
 
     def __init__(self, quality: Quality = "high", *, prefilter: Quality | None = "high") -> None:
-        super().__init__()
-        self.quality = quality
-        self.needs = Needs(uses=frozenset(_FEATURES), trainable=False)
+        super().__init__(quality)
         self.networks = nn.ModuleDict()
         self._network(_IMAGES, quality, clean=False)
         if prefilter:
@@ -135,19 +133,10 @@ class OpenFilters(nn.Module):
         """Nothing: the library has the weights."""
         return {} if destination is None else destination
 
-    def denoised(self, frame: Frame, auxiliary: Auxiliary) -> Tensor:
-        """The denoised color ``(B, 3, H, W)``, see :meth:`mcdenoise.models.oidn.Oidn.denoised`."""
-        network = self._network(("color", *guides_of(frame)), self.quality, clean=auxiliary != "noisy").to(
-            frame.color.device
-        )
-        image: Tensor = network(prepared(network, frame.replace(statistics={}, skip=None, layers={})))[0].image
-        return image
-
-    def with_clean_features(self, frame: Frame, quality: Quality) -> Frame:
-        """The frame with denoised features, see :meth:`mcdenoise.models.oidn.Oidn.with_clean_features`."""
-        guides = guides_of(frame).items()
-        clean = {name: self._network((name,), quality, clean=False).to(image.device)(image) for name, image in guides}
-        return frame.replace(**clean)
+    def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
+        """See :meth:`mcdenoise.models.oidn.Filters.filtered`."""
+        device = next(iter(images.values())).device
+        return _run(self._network(tuple(images), quality, clean=clean).to(device), images)
 
     def _network(self, images: tuple[str, ...], quality: Quality, *, clean: bool) -> Any:
         key = "-".join([*images, quality, str(clean)])
@@ -164,6 +153,13 @@ def _made(images: Sequence[str], quality: Quality, clean: bool) -> OidnOpen | Fe
     if images[0] != "color":
         return FeatureFilter(images[0], "large" if quality == "high" else "base")
     return OidnOpen("small" if quality == "fast" else "large" if quality == "high" and clean else "base", images[1:])
+
+
+def _run(network: Any, images: Mapping[str, Any]) -> Tensor:
+    """The result of a network for these images."""
+    if "color" not in images:
+        return network(*images.values())  # type: ignore[no-any-return]
+    return network(prepared(network, Frame(**images)))[0].image  # type: ignore[no-any-return]
 
 
 @functools.cache
@@ -193,7 +189,7 @@ def archive_of_library(
         except InputError:
             continue
         with torch.no_grad(), torch.autocast("cpu", enabled=False):
-            found = model(Frame(**probe))[0].image if "color" in images else model(*probe.values())
+            found = _run(model, probe)
         if float((found - wanted).abs().max()) < _CLOSE:
             return archive
     raise InputError(f"{path}: expected the weights that the library denoises with, found none")

@@ -12,47 +12,33 @@ from __future__ import annotations
 
 from typing import Literal
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import Frame
+from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._entries import register_model
-from mcdenoise.models._interface import Model, Needs, Output, State
-from mcdenoise.models._layers import answered
+from mcdenoise.models._interface import Model
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.oidn import Quality
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.models.with_oidn import OIDN, OIDN_ALBEDO, OIDN_CLEAN, Engine, WithOidn
+from mcdenoise.models.with_oidn import OIDN_ALBEDO, Engine, WithOidn
 
 # Weight of the image for clean features relative to that for noisy ones. On 74 frames of training data the errors of
 # weights from 2 to 8 differ by at most 1 %.
 _CLEAN_PART = 3.0
 
 
-class Mixed(nn.Module):
-    """A weighted mean of Open Image Denoise's images: ``(oidn + a oidn_clean) / (1 + a)``.
-
-    :class:`mcdenoise.models.with_oidn.WithOidn` provides both images.
+def mixed(oidn: Tensor, oidn_clean: Tensor | None = None) -> Tensor:
+    """A weighted mean of Open Image Denoise's images: ``(oidn + 3 oidn_clean) / 4``.
 
     Args:
-        clean_part: the weight a, at least 0. With 0, the second image is not used.
+        oidn: ``(B, 3, H, W)`` for noisy features, see :class:`mcdenoise.models.with_oidn.WithOidn`.
+        oidn_clean: likewise, for clean ones; ``None`` for the first image alone.
     """
-
-    def __init__(self, clean_part: float = _CLEAN_PART) -> None:
-        super().__init__()
-        self.clean_part = clean_part
-        self.needs = Needs(uses=frozenset({OIDN, OIDN_CLEAN} if clean_part else {OIDN}), trainable=False, reach=0)
-
-    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        """See :class:`mcdenoise.models.Model`."""
-        image: Tensor = frame.extra.get(OIDN, frame.color)
-        if self.clean_part:
-            clean = frame.extra.get(OIDN_CLEAN, frame.color)
-            image = (image + self.clean_part * clean) / (1 + self.clean_part)
-        return answered(frame, image, None), None
+    return oidn if oidn_clean is None else (oidn + _CLEAN_PART * oidn_clean) / (1 + _CLEAN_PART)
 
 
 @register_model("oidn_temporal", kind="peer", requires="pyoidn")
@@ -84,6 +70,6 @@ def oidn_temporal(
         raise InputError(f"auxiliary: expected both or noisy, found '{auxiliary}'")
     both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
-    chain = Chain(mixed=Mixed(_CLEAN_PART if both else 0.0), steadied=steadied)
+    chain = Chain(mixed=FromBuffers(mixed), steadied=steadied)
     model = WithOidn(chain, quality=quality, prefilter=prefilter, threads=threads, engine=engine, clean=both)
     return Restored(model) if restore else model

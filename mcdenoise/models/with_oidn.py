@@ -26,7 +26,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.oidn import Oidn, Quality
+from mcdenoise.models.oidn import Filters, Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.models.tiled import with_border, without_border
 from mcdenoise.noise import noise_is_spread
@@ -142,7 +142,7 @@ class WithOidn(Wrapper):
         automatic = self.engine == "auto" and fastest_precision(torch.device("cpu")).precision == "bfloat16"
         return self.engine == "torch" or automatic
 
-    def _faster(self) -> Oidn | OpenFilters:
+    def _faster(self) -> Filters:
         """The library, or its networks in torch, which are loaded for the first frame that is denoised by them."""
         if self._filters is None and torch.is_autocast_enabled("cpu") and self.has_network:
             self._filters = self._made_in_torch()

@@ -5,23 +5,24 @@ from __future__ import annotations
 import copy
 import importlib.util
 import itertools
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from planes import plane
+from refusals import refused
 from torch import Tensor
-from toys import frame_of, refused, whole_frame
+from toys import frame_of, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model
+from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._precision import Chosen, Precision, has_network
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_temporal import Mixed
+from mcdenoise.models.oidn_temporal import mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import MIRRORED
@@ -153,13 +154,6 @@ def test_a_pattern_of_two_by_two_pixels_is_removed_and_an_edge_kept(unit: float)
     torch.testing.assert_close(found[0, 0, 4, 5:7], torch.tensor([1.04, 3 * 0.96]), rtol=0.01, atol=0)
 
 
-def test_the_weight_of_the_image_for_clean_features() -> None:
-    frame = frame_of(9, 18)
-    noisy, clean = torch.rand(2, 1, 3, 9, 18)
-    image = Mixed()(frame.replace(extra={OIDN: noisy, OIDN_CLEAN: clean}))[0].image
-    torch.testing.assert_close(image, (noisy + 3 * clean) / 4)
-
-
 @pytest.mark.parametrize("centred", [0.0, 1.0])
 def test_weights_written_out_in_float64(centred: float) -> None:
     height, width, history = 9, 18, 7.0
@@ -272,11 +266,6 @@ def test_a_copy_has_a_library_of_its_own() -> None:
     assert torch.equal(other(frame)[0].image, model(frame)[0].image)
 
 
-def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    assert "pip install 'mcdenoise[oidn]'" in refused(lambda: create_model(NAME))
-
-
 @pytest.mark.parametrize(("offset", "specks"), [(0, 0), (1, 0), (0, 1)])
 def test_features_are_denoised_unless_they_are_exact(offset: int, specks: int) -> None:
     frame = plane(offset * torch.rand(2, 40, 60)).replace(albedo=torch.rand(1, 3, 40, 60))
@@ -329,7 +318,7 @@ def test_both_engines_give_the_same_sequence(auxiliary: str) -> None:
 
 def test_training_begins_behind_oidn() -> None:
     """Its images are computed into the cache. They are light, and clips scale them as such."""
-    model = WithOidn(Mixed(), threads=1)
+    model = WithOidn(FromBuffers(mixed), threads=1)
     front, rest = split(model)
     assert [kind for kind, _ in front.wrappers] == [WithOidn]
     assert (front.accumulates, front.demodulates) == (False, False)
