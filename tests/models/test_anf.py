@@ -5,22 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import nn
-from toys import frame_of, small
+from toys import drawn, frame_of, small
 
 from mcdenoise import Frame
 from mcdenoise.models.anf import Anf
 
 SIZE = (6, 7)
-
-
-def drawn(width: int = 6) -> Any:
-    """Return the model in float64, with weights so that every part of the equations has an effect."""
-    torch.manual_seed(2)
-    model = Anf(width).double()
-    for parameter in model.parameters():
-        nn.init.normal_(parameter, std=0.25)
-    return model
 
 
 def shot(frames: int = 3, size: tuple[int, int] = SIZE, **buffers: Any) -> list[Frame]:
@@ -51,7 +41,7 @@ def test_samples_that_are_all_the_color_are_as_none_and_their_order_says_nothing
 @torch.no_grad()
 def test_pixels_of_another_surface_have_no_weight() -> None:
     """In a frame of another depth nothing of the one before is left, however bright it was."""
-    model = drawn()
+    model = drawn(Anf(6), 0.25)
     first, second, _ = shot()
     assert second.depth is not None
     moved = second.replace(depth=2 * second.depth)

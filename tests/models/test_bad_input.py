@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from test_models import KINDS, SIZES, TRAINABLE, WIDTH, tensors
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import refused, small, whole_frame
+from toys import small, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.errors import MissingBufferError

@@ -1,15 +1,15 @@
-"""The paper's network against its equations, written out in float64 with loops."""
+"""The paper's network against its equations, in float64, with those of the ops as loops over pixels."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as F
+from oracles import filters, resolutions
 from torch import Tensor, nn
-from toys import small, whole_frame
+from toys import frame_of, small, whole_frame
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Chain, create_model
@@ -33,46 +33,14 @@ def drawn(network: nn.Module) -> Any:
     return network.double()
 
 
-def frame_of_doubles(height: int, width: int, batch: int = 1) -> Frame:
-    generator = torch.Generator().manual_seed(5)
-
-    def image(channels: int) -> Tensor:
-        return torch.rand(batch, channels, height, width, generator=generator, dtype=torch.float64)
-
-    depth = 1 + 9 * image(1)
-    depth[..., 0, 0] = torch.inf
-    return Frame(4 * image(3).square(), albedo=image(3), normal=F.normalize(image(3) - 0.5, dim=1), depth=depth)
-
-
-def halved(image: Tensor) -> Tensor:
-    """D of Eq. 2: means of 2x2 pixels, of those that there are."""
-    height, width = image.shape[-2:]
-    result = image.new_zeros(*image.shape[:2], -(-height // 2), -(-width // 2))
-    for y in range(result.shape[-2]):
-        for x in range(result.shape[-1]):
-            result[..., y, x] = image[..., 2 * y : 2 * y + 2, 2 * x : 2 * x + 2].mean((-2, -1))
-    return result
-
-
-def doubled(image: Tensor, height: int, width: int) -> Tensor:
-    """U of Eq. 2."""
-    result = image.new_zeros(*image.shape[:2], height, width)
-    for y in range(height):
-        for x in range(width):
-            result[..., y, x] = image[..., y // 2, x // 2]
-    return result
-
-
 def fused(network: Any, images: list[Tensor]) -> Tensor:
-    """Eq. 2 from the coarsest scale to the finest: o = i_f - alpha U D i_f + alpha U i_c."""
+    """Eq. 2 from the coarsest scale to the finest."""
     coarse = images[-1]
     for fine, module in zip((images[1], images[0]), network.fusions, strict=True):
-        above = doubled(coarse, *fine.shape[-2:])
-        alpha = 1 / (
-            1 + torch.exp(-F.conv2d(torch.cat([fine, above], 1), module.conv.weight, module.conv.bias, padding=1))
-        )
+        above = resolutions.upsample(coarse, (fine.shape[-2], fine.shape[-1]))
+        alpha = torch.sigmoid(F.conv2d(torch.cat([fine, above], 1), module.conv.weight, module.conv.bias, padding=1))
         assert alpha.shape[1] == 1
-        coarse = fine - alpha * doubled(halved(fine), *fine.shape[-2:]) + alpha * above
+        coarse = resolutions.laplacian_fusion(fine, coarse, alpha)
     return coarse
 
 
@@ -88,46 +56,6 @@ def features(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     return frame.albedo, (frame.normal + 1) / 2, near
 
 
-def adjusted(logits: Tensor, f: Tensor | None, normal: Tensor, depth: Tensor, normalize: str) -> Tensor:
-    """Eqs. 5-8, pixel by pixel and tap by tap; a tap outside the image sees the pixel of the edge that is next."""
-    _, taps, height, width = logits.shape
-    side = math.isqrt(taps)
-    exponent = logits.clone()
-    for y in range(height):
-        for x in range(width):
-            for tap in range(taps):
-                dy, dx = tap // side - side // 2, tap % side - side // 2
-                qy, qx = min(max(y + dy, 0), height - 1), min(max(x + dx, 0), width - 1)
-                if f is not None:
-                    f1, f2, f3 = f[:, 0, y, x], f[:, 1, y, x], f[:, 2, y, x]
-                    dn = (normal[..., y, x] - normal[..., qy, qx]).square().sum(1)
-                    dd = (depth[:, 0, y, x] - depth[:, 0, qy, qx]).square()
-                    factor = -f1 * dn - f2 * dd - f3 * (dy**2 + dx**2)
-                    exponent[:, tap, y, x] = (
-                        exponent[:, tap, y, x] + factor
-                        if normalize == "softmax"
-                        else logits[:, tap, y, x] * torch.exp(factor)
-                    )
-    if normalize == "none":
-        return exponent
-    weights = torch.exp(exponent)
-    return weights / weights.sum(1, keepdim=True)
-
-
-def filtered(image: Tensor, weights: Tensor) -> Tensor:
-    """Eq. 4."""
-    _, taps, height, width = weights.shape
-    side = math.isqrt(taps)
-    result = torch.zeros_like(image)
-    for y in range(height):
-        for x in range(width):
-            for tap in range(taps):
-                qy = min(max(y + tap // side - side // 2, 0), height - 1)
-                qx = min(max(x + tap % side - side // 2, 0), width - 1)
-                result[..., y, x] += weights[:, tap, y, x, None] * image[..., qy, qx]
-    return result
-
-
 def predictions(network: Any, frame: Frame) -> list[Tensor]:
     """Return the predictions of the heads, from the ten channels that the paper names."""
     levels = network.unet(torch.cat([frame.color, *features(frame)], 1))
@@ -140,9 +68,7 @@ def predictions(network: Any, frame: Frame) -> list[Tensor]:
 @torch.no_grad()
 def test_the_pixel_network_written_out(size: tuple[int, int]) -> None:
     """Eqs. 1 and 2."""
-    network, frame = drawn(PixelNetwork(8)), frame_of_doubles(*size, batch=2 if size == (8, 8) else 1)
-    if size == (1, 1):
-        frame = frame.replace(depth=torch.full((1, 1, 1, 1), 3.0, dtype=torch.float64))
+    network, frame = drawn(PixelNetwork(8)), frame_of(*size, batch=2 if size == (8, 8) else 1).to(torch.float64)
     if len(frame.color) == 2:
         # The typical depth is that of each image.
         single = [frame.map(lambda image, i=i: image[i : i + 1]) for i in (0, 1)]
@@ -162,16 +88,19 @@ def test_the_pixel_network_written_out(size: tuple[int, int]) -> None:
 def test_the_kernel_network_written_out(kernel_size: int, bilateral: bool, normalize: Any) -> None:
     """Eqs. 3 to 8, and their fusion by Eq. 2."""
     network = drawn(KernelNetwork(8, kernel_size, bilateral, normalize))
-    frame = frame_of_doubles(*SIZE)
+    frame = frame_of(*SIZE).to(torch.float64)
     image, (_, normal, depth) = frame.color, features(frame)
     images = []
     for scale, predicted in enumerate(predictions(network, frame)):
         if scale:
-            image, normal, depth = halved(image), halved(normal), halved(depth)
+            image, normal, depth = (resolutions.downsample(each) for each in (image, normal, depth))
         logits, rest = predicted[:, : kernel_size**2], predicted[:, kernel_size**2 :]
         assert rest.shape[1] == (3 if bilateral else 0)
-        f = torch.log1p(torch.exp(rest)) if bilateral else None
-        images.append(filtered(image, adjusted(logits, f, normal, depth, normalize)))
+        *of_features, of_distance = torch.log1p(torch.exp(rest)).split(1, 1) if bilateral else [None]
+        guides = [normal, depth] if bilateral else []
+        images.append(
+            filters.cross_bilateral_filter(image, logits, guides, of_features, of_distance, normalize=normalize)
+        )
     output, _ = network(frame)
     torch.testing.assert_close(output.image, fused(network, images), rtol=1e-9, atol=1e-10)
 
@@ -181,7 +110,7 @@ def test_the_whole_method_written_out() -> None:
     """A first frame: demodulation, exposure, P, K, and what is below zero is cut off."""
     model = create_model("cascaded", width=8)
     drawn(model)
-    frame = frame_of_doubles(*SIZE)
+    frame = frame_of(*SIZE).to(torch.float64)
     assert frame.albedo is not None
     textured = (frame.albedo >= 1e-4).any(1, keepdim=True)
     assert textured.all()
@@ -222,7 +151,7 @@ def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:
 
 def test_without_bilateral_weights_features_matter_to_the_u_net_alone() -> None:
     """If the U-Net is blind, normals change the filtered image with the weights, and not without them."""
-    frame = frame_of_doubles(*SIZE)
+    frame = frame_of(*SIZE).to(torch.float64)
     assert frame.normal is not None
     other = frame.replace(normal=frame.normal.flip(3))
     for bilateral, same in ((True, False), (False, True)):
@@ -235,7 +164,7 @@ def test_kernels_keep_a_constant_image() -> None:
     """Weights have the sum 1, and Eq. 2 returns what both scales agree on."""
     for bilateral in (True, False):
         network = drawn(KernelNetwork(8, bilateral=bilateral))
-        frame = frame_of_doubles(13, 18)
+        frame = frame_of(13, 18).to(torch.float64)
         frame = frame.replace(color=torch.full_like(frame.color, 0.7))
         torch.testing.assert_close(network(frame)[0].image, frame.color, rtol=0, atol=1e-12)
     network = drawn(KernelNetwork(8, normalize="none"))

@@ -16,9 +16,10 @@ import kornia  # noqa: F401 - makes constants when it is first imported
 import pytest
 import torch
 from reads import without_reads
+from refusals import refused
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
-from toys import Same, one_of_each, refused, small, whole_frame
+from toys import Same, one_of_each, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
 from mcdenoise.models import Accumulated, Demodulated, Output, _report, _times, list_models

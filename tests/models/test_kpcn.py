@@ -1,29 +1,20 @@
-"""KPCN against its equations, written out in float64 with loops."""
+"""KPCN against its equations, in float64, with that of its filter as loops over pixels."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from oracles.filters import cross_bilateral_filter
 from torch import Tensor, nn
-from toys import frame_of
+from toys import drawn, frame_of
 
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models import create_model
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.kpcn import CHANNELS, KpcnNetwork
 from mcdenoise.ops import luminance_moments, moments_variance
-
-
-def drawn(width: int = 4, layers: int = 3, kernel_size: int = 3) -> KpcnNetwork:
-    """Return the network with weights in float64, so that every part of the equations has an effect."""
-    torch.manual_seed(3)
-    network = KpcnNetwork(width, layers, kernel_size).double()
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, std=0.1)
-    return network
 
 
 def parts(height: int, width: int, **changes: Any) -> Frame:
@@ -34,7 +25,7 @@ def parts(height: int, width: int, **changes: Any) -> Frame:
 
 
 def seen(image: Tensor, frame: Frame) -> Tensor:
-    """The 27 channels, pixel by pixel."""
+    """The 27 channels."""
     albedo, normal, depth = frame.albedo, frame.normal, frame.depth
     assert albedo is not None
     assert normal is not None
@@ -47,13 +38,8 @@ def seen(image: Tensor, frame: Frame) -> Tensor:
     )
     values = torch.cat([bright, features], 1)
     across, down = torch.zeros_like(values), torch.zeros_like(values)
-    height, width = image.shape[-2:]
-    for y in range(height):
-        for x in range(width):
-            if x + 1 < width:
-                across[..., y, x] = values[..., y, x + 1] - values[..., y, x]
-            if y + 1 < height:
-                down[..., y, x] = values[..., y + 1, x] - values[..., y, x]
+    across[..., :-1] = values[..., 1:] - values[..., :-1]
+    down[..., :-1, :] = values[..., 1:, :] - values[..., :-1, :]
     variance = moments_variance(luminance_moments(image), normal, depth, kernel_size=7)
     return torch.cat([image, features, across, down, torch.log(1 + variance)], 1)
 
@@ -65,24 +51,12 @@ def filtered(branch: Any, image: Tensor, frame: Frame) -> Tensor:
     convolutions = [layer for layer in branch if isinstance(layer, nn.Conv2d)]
     for number, layer in enumerate(convolutions):
         x = F.conv2d(x if number == 0 else x.clamp_min(0), layer.weight, layer.bias, padding=2)
-    side, (height, width) = math.isqrt(x.shape[1]), image.shape[-2:]
-    result = torch.zeros_like(image)
-    for y in range(height):
-        for x_ in range(width):
-            total = torch.zeros(1, 3).double()
-            weights = 0.0
-            for tap in range(side**2):
-                qy, qx = y + tap // side - side // 2, x_ + tap % side - side // 2
-                if 0 <= qy < height and 0 <= qx < width:
-                    weight = math.exp(float(x[0, tap, y, x_]))
-                    total, weights = total + weight * image[..., qy, qx], weights + weight
-            result[..., y, x_] = total / weights
-    return result
+    return cross_bilateral_filter(image, x, border="renormalize")
 
 
 @torch.no_grad()
 def test_color_only_is_the_diffuse_branch() -> None:
-    network, frame = drawn(), parts(6, 7)
+    network, frame = drawn(KpcnNetwork(4, 3, 3), 0.1), parts(6, 7)
     alone = frame.replace(diffuse=None, specular=None)
     expected = filtered(network.diffuse, frame.color, frame)
     torch.testing.assert_close(network(alone)[0].image, expected, rtol=1e-9, atol=1e-9)
@@ -93,7 +67,7 @@ def test_color_only_is_the_diffuse_branch() -> None:
 
 
 def test_color_only_teaches_the_diffuse_branch_only() -> None:
-    network = drawn()
+    network = drawn(KpcnNetwork(4, 3, 3), 0.1)
     network(parts(6, 7, diffuse=None, specular=None))[0].image.sum().backward()
     assert all(parameter.grad is not None for parameter in network.diffuse.parameters())
     assert all(parameter.grad is None for parameter in network.specular.parameters())
@@ -108,8 +82,8 @@ def test_a_network_for_color_alone_has_one_branch_and_says_so() -> None:
     expected = filtered(network.diffuse, frame.color, frame)
     for each, given, reason in (
         (network, frame, "these weights are for color alone"),
-        (drawn(), frame.replace(diffuse=None), "no diffuse and specular light"),
-        (drawn(), frame, "diffuse and specular light"),
+        (drawn(KpcnNetwork(4, 3, 3), 0.1), frame.replace(diffuse=None), "no diffuse and specular light"),
+        (drawn(KpcnNetwork(4, 3, 3), 0.1), frame, "diffuse and specular light"),
     ):
         output, _ = each(given)
         assert output.notes[0][:3] == ("specular branch", reason, reason != "diffuse and specular light")
@@ -140,7 +114,7 @@ def test_both_parts_have_a_history() -> None:
 
 @torch.no_grad()
 def test_layers_are_filtered_with_the_kernels_of_their_light() -> None:
-    network, frame = drawn(), parts(6, 7)
+    network, frame = drawn(KpcnNetwork(4, 3, 3), 0.1), parts(6, 7)
     assert frame.diffuse is not None
     assert frame.specular is not None
     layers = {"matt": frame.diffuse, "shiny": frame.specular}

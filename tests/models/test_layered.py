@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from toys import sampled
+from toys import drawn, sampled
 
 from mcdenoise.models.layered import LayeredNetwork
-
-
-def drawn(width: int = 4, convolutions: int = 1, kernel_size: int = 3) -> LayeredNetwork:
-    """Return the network with weights in float64, so that every part of the equations has an effect."""
-    torch.manual_seed(3)
-    network = LayeredNetwork(width, convolutions, kernel_size).double()
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, std=0.4)
-    return network
 
 
 @torch.no_grad()
 def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     """Where bright samples are behind and the front is opaque, the image is as without them, up to the least weight."""
-    network, given = drawn(), sampled(5, 6)
+    network, given = drawn(LayeredNetwork(4, 1, 3), 0.4), sampled(5, 6)
     assert given.samples is not None
     samples = given.samples.clone()
     samples[:, 0, :, 2, 3] = 1e3

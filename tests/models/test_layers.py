@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor, nn
-from toys import Same, cascade, frame_of, one_of_each, refused, small, still, whole_frame
+from toys import Same, cascade, frame_of, one_of_each, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, Skipping, Tiled, list_models
@@ -21,19 +19,9 @@ from mcdenoise.models.joint_bilateral import JointBilateral
 from mcdenoise.models.noisy import Noisy
 
 OIDN = ("oidn", "oidn_open", "oidn_temporal")
-MODELS = [
-    pytest.param(
-        name,
-        marks=pytest.mark.skipif(
-            name in OIDN and importlib.util.find_spec("pyoidn") is None, reason="it is in the extra mcdenoise[oidn]"
-        ),
-    )
-    for name in one_of_each(list_models())
-]
+MODELS = one_of_each(list_models())
 # For the other methods the library decides on derivatives, or there are none.
-DIFFERENTIABLE = [each for each in MODELS if each.values[0] not in OIDN]
-# The alpha of a method without kernels is filtered by its own noise; its layers are split by their fractions.
-WITHOUT_KERNELS = (*OIDN, "rae", "wild")
+DIFFERENTIABLE = [name for name in MODELS if name not in OIDN]
 # The history of these is of images, or of hidden features, alone: no layer of a frame reaches the next frame's layers.
 HISTORY_OF_IMAGES = ("rae",)
 NAMES = ("diffuse", "glossy", "emission")
@@ -136,7 +124,7 @@ def test_a_layer_that_is_all_is_the_image_and_one_that_is_black_stays_black(name
         assert not output.layers["none"].any()
 
 
-@pytest.mark.parametrize("name", [each for each in MODELS if each.values[0] not in ("guided", "cascaded", "bmfr")])
+@pytest.mark.parametrize("name", sorted(set(MODELS) - {"guided", "cascaded", "bmfr"}))
 @torch.no_grad()
 def test_layers_are_denoised_by_a_linear_map(name: str) -> None:
     """Joined before or after, and scaled before or after.
@@ -420,9 +408,3 @@ def test_where_layers_are_asked_for_no_tile_is_passed_through_or_used_again() ->
     stages = denoiser.report.stages
     for name in ("converged tiles", "unchanged tiles"):
         assert (stages[name].skipped, stages[name].reason) == (0, "layers or alpha are asked for")
-
-
-def test_the_code_of_the_page_runs() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "layers.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(block, "layers.md", "exec"), {"__name__": "page"})

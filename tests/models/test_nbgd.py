@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import torch
-from test_cascaded import drawn, frame_of_doubles
-from toys import whole_frame
+from toys import drawn, frame_of, whole_frame
 
 from mcdenoise.models.nbgd import NeuralBilateralGrid
 
@@ -12,7 +11,7 @@ from mcdenoise.models.nbgd import NeuralBilateralGrid
 @torch.no_grad()
 def test_a_constant_light_stays_what_it_is() -> None:
     """The weights of the grids sum to one, whatever the network says."""
-    network, frame = drawn(NeuralBilateralGrid()), frame_of_doubles(21, 35)
+    network, frame = drawn(NeuralBilateralGrid()), frame_of(21, 35).to(torch.float64)
     frame = frame.replace(color=torch.full_like(frame.color, 0.7))
     torch.testing.assert_close(network(frame)[0].image, frame.color, rtol=1e-12, atol=0)
 

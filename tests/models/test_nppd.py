@@ -13,16 +13,6 @@ from mcdenoise.models import create_model
 from mcdenoise.ops import reproject
 
 
-def logarithm(x: Tensor) -> Tensor:
-    """Return the logarithm of one image or stack of images, relative to its mean."""
-    return torch.log(1 + x / x.mean())
-
-
-def convolutions(layers: list[tuple[int, int]], side: int) -> int:
-    """Weights and biases of convolutions."""
-    return sum(entering * leaving * side**2 + leaving for entering, leaving in layers)
-
-
 def decided(**biases: Tensor | float) -> Any:
     """A model whose weights do not depend on the frame: softmaxes of zeros, or of what is given.
 

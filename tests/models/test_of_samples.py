@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from torch import nn
-from toys import sampled
+from toys import drawn, sampled
 
 from mcdenoise.frame import Hints
 from mcdenoise.models import create_model
@@ -19,15 +18,6 @@ NETWORKS: dict[str, Callable[[], LayeredNetwork | SbmcNetwork]] = {
     "sbmc": lambda: SbmcNetwork(4, 2, 1, 3),
 }
 both = pytest.mark.parametrize("name", NETWORKS)
-
-
-def drawn(name: str) -> LayeredNetwork | SbmcNetwork:
-    """Return the network with weights in float64, so that every part of the equations has an effect."""
-    torch.manual_seed(3)
-    network = NETWORKS[name]().double()
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, std=0.4)
-    return network
 
 
 @both
@@ -45,7 +35,7 @@ def test_light_without_noise_comes_back(name: str) -> None:
 @both
 @torch.no_grad()
 def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
-    network, given = drawn(name), sampled(5, 6, samples=1)
+    network, given = drawn(NETWORKS[name](), 0.4), sampled(5, 6, samples=1)
     layers = {"half": given.color / 2, "rest": given.color / 2}
     alpha = torch.ones_like(given.color[:, :1])
     output, _ = network(given.replace(layers=layers, alpha=alpha, hints=Hints(alpha=True)))

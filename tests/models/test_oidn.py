@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from torch import Tensor
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Demodulated, create_model
+from mcdenoise.models import Accumulated, Demodulated
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.ops import demodulate, remodulate
@@ -118,15 +117,6 @@ def test_sources(pyoidn: Any) -> None:
         assert not torch.allclose(one, other, rtol=1e-2, atol=1e-2)
 
 
-def test_history_survives_a_resize(pyoidn: Any) -> None:
-    denoiser = Denoiser("oidn", source="accumulated after", threads=1)
-    for number, size in enumerate(((36, 52), (36, 52), (17, 21))):
-        given = frame(*size)
-        given = given.replace(color=given.color.roll(number, -1))
-        assert denoiser(given).shape == given.color.shape
-    assert denoiser.report.reset == "size change"
-
-
 def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
     given = frame()
     given.color.requires_grad_()
@@ -134,10 +124,3 @@ def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
         Oidn(threads=1)(given)
     with torch.no_grad():
         assert not Oidn(threads=1)(given)[0].image.requires_grad
-
-
-def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match=r"pyoidn.*mcdenoise\[oidn\]") as caught:
-        create_model("oidn")
-    assert "\n" not in str(caught.value)

@@ -6,21 +6,21 @@ import importlib.util
 import itertools
 import math
 import struct
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
-from toys import frame_of, refused
+from toys import frame_of
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_open import OidnOpen, OpenFilters, archive_of_library
+from mcdenoise.models.oidn_open import OidnOpen, OpenFilters
 from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
 from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
 
@@ -112,12 +112,6 @@ def test_refuses_unsupported_options() -> None:
     assert "found 'prefiltered'" in refused(lambda: create_model(NAME, auxiliary="prefiltered"))
     model = create_model(NAME)
     assert model.needs.missing(Frame(torch.rand(1, 3, 8, 8))) == ["albedo", "normal"]
-
-
-def test_without_the_package_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
-    archive_of_library.cache_clear()
-    assert "pip install 'mcdenoise[oidn]'" in refused(lambda: create_model(NAME, quality="balanced"))
 
 
 def written_out(unet: OidnUNet, x: Tensor) -> Tensor:

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from torch import nn
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import _registry, list_models, register_model
+from mcdenoise.models import _registry, create_model, list_models, register_model
 from mcdenoise.models._entries import Kind
 from mcdenoise.models._overview import overview
+from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.models.oidn_open import archive_of_library
 
 
@@ -27,18 +29,23 @@ def test_lists_every_model_by_kind_and_name() -> None:
     assert all(entry.kind != "other" for entry in entries)
     for entry in entries:
         assert (entry.parameters > 0) is (entry.kmacs_per_pixel is not None)
-        assert not entry.trainable or entry.parameters
-        assert entry.description or entry.reason
-        assert "color" in entry.needs or entry.reason
+        model = create_model(entry.name)
+        parameters = model.parameters() if isinstance(model, nn.Module) else []
+        assert entry.parameters == sum(parameter.numel() for parameter in parameters)
+        assert (set(entry.needs), set(entry.uses)) == (model.needs.buffers, model.needs.uses)
+        assert entry.trainable is model.needs.trainable
+        assert entry.description
+        assert "\n" not in entry.description
+        assert (entry.weights == "shipped") is (entry.name in pretrained_models())
+        assert (entry.weights == "compared") is (entry.name in compared_models())
     by_name = {entry.name: entry for entry in entries}
     small = by_name["wild_small"]
-    assert (small.kind, small.weights) == ("recurrent", "shipped")
-    assert (by_name["cascaded"].weights, by_name["svgf"].paper) == ("compared", "Schied et al. 2017")
+    assert (small.kind, by_name["svgf"].paper) == ("recurrent", "Schied et al. 2017")
     # Multiply-adds are no fewer than a sixteenth of the weights, of which each is used once in 4x4 pixels or more.
     assert small.kmacs_per_pixel is not None
     assert small.kmacs_per_pixel > small.parameters / 64 / 1e3
     assert by_name["svgf"].needs == ["color", "depth", "normal"]
-    assert (by_name["noisy"].weights, by_name["noisy"].uses) == ("none", [])
+    assert by_name["noisy"].weights == "none"
 
 
 def test_a_model_without_its_package_is_listed_with_the_reason(

@@ -11,9 +11,8 @@ import pytest
 import torch
 from refusals import refused
 from torch import Tensor, nn
-from torch.utils import _pytree as pytree
 
-from mcdenoise import Denoiser, Frame, InputError, create_model
+from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.models import Needs, Output, State
 
 SIZE = (24, 32)
@@ -68,51 +67,43 @@ def fails():
     return path
 
 
-def own(path: Path, name: str) -> str:
-    return f"{path}:{name}"
-
-
-def test_a_factory_of_ones_own_is_a_model(mine: Path) -> None:
-    denoiser = Denoiser(own(mine, "network"), channels=8)
-    assert sum(parameter.numel() for parameter in denoiser.model.parameters()) == 6 * 8 * 9 + 8 + 8 * 3 * 9 + 3
-    assert denoiser(frame(albedo=torch.rand(1, 3, *SIZE))).shape == (1, 3, *SIZE)
+def test_a_factory_of_ones_own_is_a_model(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(mine.parent)
+    for place in (str(mine), "mine"):
+        denoiser = Denoiser(f"{place}:network", channels=8)
+        assert sum(parameter.numel() for parameter in denoiser.model.parameters()) == 6 * 8 * 9 + 8 + 8 * 3 * 9 + 3
+        assert denoiser(frame(albedo=torch.rand(1, 3, *SIZE))).shape == (1, 3, *SIZE)
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("absent", r"expected a factory 'absent' in .*mine\.py, found .*network"),
-        ("number", "expected a factory, .* returns a model, found an object of type int; add a function"),
-        ("instance", "expected a factory, .* returns a model, found an object of type Blur; add a function"),
-        ("denoise", "expected a factory, .* found one that requires color, albedo; if it is the model, add a function"),
-        ("nothing", "expected a model with `needs` .*found int"),
-        ("fails", "RuntimeError: no luck today"),
+        ("{folder}/mine.py:absent", r"expected a factory 'absent' in .*mine\.py, found .*network"),
+        ("{folder}/mine.py:", "expected a factory"),
+        ("{folder}/mine.py:number", "expected a factory, .* a model, found an object of type int; add a function"),
+        ("{folder}/mine.py:instance", "expected a factory, .* a model, found an object of type Blur; add a function"),
+        (
+            "{folder}/mine.py:denoise",
+            "expected a factory, .* found one that requires color, albedo; if it is the model, add a function",
+        ),
+        ("{folder}/mine.py:nothing", "expected a model with `needs` .*found int"),
+        ("{folder}/mine.py:fails", "RuntimeError: no luck today"),
+        ("{folder}/absent.py:network", "no such file"),
+        ("{folder}/absent.py", "no such file"),
+        ("{folder}/several.py", r"several\.py.* :smooth or :Sharp$"),
+        ("{folder}/misspelt.py", r"misspelt\.py.* :factory$"),
+        ("{folder}/misspelt.py:smooth", "cannot be imported: SyntaxError"),
+        ("{folder}/broken.py:network", r"broken\.py.*ModuleNotFoundError"),
+        ("package.of.nobody:network", r"package\.of\.nobody.*ModuleNotFoundError"),
+        ("..:network", "cannot be imported"),
+        (":", "cannot be imported"),
     ],
 )
-def test_an_invalid_factory_is_refused_in_one_line(mine: Path, name: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        create_model(own(mine, name))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_factory_has_to_be_somewhere(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        create_model(f"{tmp_path}/absent.py:network")
-    several = tmp_path / "several.py"
-    several.write_text("raise SystemExit\n\ndef smooth(): ...\n\nclass Sharp: ...\n\ndef _hidden(): ...")
-    with pytest.raises(InputError, match=r"several\.py.* :smooth or :Sharp$"):
-        create_model(str(several))
-    several.write_text("def smooth(:")
-    with pytest.raises(InputError, match=r"several\.py.* :factory$"):
-        create_model(str(several))
-    with pytest.raises(InputError, match="no such file"):
-        create_model(f"{tmp_path}/absent.py")
-    broken = tmp_path / "broken.py"
-    broken.write_text("import nothing_of_this_name")
-    with pytest.raises(InputError, match=r"broken\.py.*ModuleNotFoundError"):
-        create_model(f"{broken}:network")
-    with pytest.raises(InputError, match=r"package\.of\.nobody"):
-        create_model("package.of.nobody:network")
+def test_a_factory_that_is_none_is_refused_in_one_line(mine: Path, name: str, message: str) -> None:
+    several = "raise SystemExit\n\ndef smooth(): ...\n\nclass Sharp: ...\n\ndef _hidden(): ..."
+    for file, text in (("several", several), ("misspelt", "def smooth(:"), ("broken", "import nothing_of_this_name")):
+        (mine.parent / f"{file}.py").write_text(text)
+    assert re.search(message, refused(lambda: create_model(name.format(folder=mine.parent))))
 
 
 def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
@@ -124,7 +115,7 @@ def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
             "from neighbour_of_mine import FACTOR\n\ndef network():\n    return lambda color: FACTOR * color\n"
         )
     path = sys.path.copy()
-    first, second = (Denoiser(own(tmp_path / folder / "mine.py", "network")) for folder in "ab")
+    first, second = (Denoiser(f"{tmp_path / folder}/mine.py:network") for folder in "ab")
     shown = frame()
     torch.testing.assert_close(first(shown), 2 * shown.color)
     torch.testing.assert_close(second(shown), 3 * shown.color)
@@ -132,13 +123,11 @@ def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
 
 
 def test_settings_are_those_of_the_factory(mine: Path) -> None:
-    with pytest.raises(InputError, match=re.escape("it takes channels")):
-        create_model(own(mine, "network"), width=3)
+    assert "it takes channels" in refused(lambda: create_model(f"{mine}:network", width=3))
 
 
 def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
-    with pytest.raises(InputError, match=r"buffer 'albedo': .*color"):
-        Denoiser(own(mine, "network"))(frame())
+    assert re.match(r"buffer 'albedo': .*color", refused(lambda: Denoiser(f"{mine}:network")(frame())))
 
 
 @pytest.mark.parametrize(
@@ -154,10 +143,7 @@ def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
     ],
 )
 def test_an_invalid_image_is_refused_in_one_line(function: Any, message: str) -> None:
-    denoiser = Denoiser(function)
-    with pytest.raises(InputError, match=message) as caught:
-        denoiser(frame())
-    assert "\n" not in str(caught.value)
+    assert re.search(message, refused(lambda: Denoiser(function)(frame())))
 
 
 class Memory(NamedTuple):
@@ -200,8 +186,7 @@ def test_an_invalid_state_is_refused_and_the_last_one_kept(misbehave: str, messa
     model = Mean(misbehave)
     denoiser, frames = Denoiser(model), [frame() for _ in range(2)]
     denoiser(frames[0])
-    with pytest.raises(InputError, match=message):
-        denoiser(frames[1])
+    assert message in refused(lambda: denoiser(frames[1]))
     # The state is still that of the first frame.
     model.misbehave = ""
     torch.testing.assert_close(denoiser(frames[1]), (frames[0].color + frames[1].color) / 2)
@@ -210,12 +195,7 @@ def test_an_invalid_state_is_refused_and_the_last_one_kept(misbehave: str, messa
 def test_a_state_of_another_size_is_refused_in_one_line_where_the_model_minds() -> None:
     denoiser = Denoiser(Mean())
     denoiser(frame())
-    with pytest.raises(
-        InputError,
-        match=r"\(1, 3, 24, 32\).*\(1, 3, 20, 32\)",
-    ) as caught:
-        denoiser(frame((20, 32)))
-    assert "\n" not in str(caught.value)
+    assert re.search(r"\(1, 3, 24, 32\).*\(1, 3, 20, 32\)", refused(lambda: denoiser(frame((20, 32)))))
     denoiser.reset()
     assert denoiser(frame((20, 32))).shape == (1, 3, 20, 32)
 
@@ -225,29 +205,7 @@ def test_a_module_that_returns_an_output_alone_lacks_a_state() -> None:
         def forward(self, frame: Frame, state: State = None) -> Output:  # type: ignore[override]
             return Output(frame.color)
 
-    with pytest.raises(InputError, match=r"\(Output, state\).* Output"):
-        Denoiser(Alone())(frame())
-
-
-def test_zeros_stand_for_no_history() -> None:
-    """They do for the whole of a model, so that a graph whose state is an input can begin with them."""
-    model = create_model("wild_small", pretrained=True)
-    color, position = torch.rand(1, 3, *SIZE), torch.rand(1, 3, *SIZE) + 1
-    camera = torch.eye(4).roll(-1, 1)[None] + 0.01 * torch.eye(4)
-    surface = {"normal": nn.functional.normalize(position), "depth": position[:, 2:]}
-    for buffers in (
-        {"motion": torch.full((1, 2, *SIZE), 0.5)},
-        {"motion": torch.zeros(1, 2, *SIZE), "depth": position[:, 2:]},
-        {"motion": torch.zeros(1, 2, *SIZE), "albedo": torch.rand(1, 3, *SIZE), **surface},
-        {"position": position, "view_projection": camera, **surface},
-    ):
-        first = Frame(color=color, **buffers)
-        with torch.no_grad():
-            output, state = model(first)
-            again, after = model(first, pytree.tree_map_only(Tensor, torch.zeros_like, state))
-        assert torch.equal(output.image, again.image)
-        for a, b in zip(pytree.tree_leaves(state), pytree.tree_leaves(after), strict=True):
-            assert a is b is None or torch.equal(a, b)
+    assert re.search(r"\(Output, state\).* Output", refused(lambda: Denoiser(Alone())(frame())))
 
 
 def test_a_compiled_module_is_a_method_as_the_module_is() -> None:

@@ -4,23 +4,14 @@ from __future__ import annotations
 
 import torch
 from torch import nn
-from toys import sampled
+from toys import drawn, sampled
 
 from mcdenoise.models.sbmc import SbmcNetwork
 
 
-def drawn(width: int = 4, rounds: int = 2, convolutions: int = 1, kernel_size: int = 3) -> SbmcNetwork:
-    """Return the network with weights in float64, so that every part of the equations has an effect."""
-    torch.manual_seed(3)
-    network = SbmcNetwork(width, rounds, convolutions, kernel_size).double()
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, std=0.4)
-    return network
-
-
 @torch.no_grad()
 def test_the_order_of_the_samples_does_not_matter() -> None:
-    network, given = drawn(), sampled(5, 6, samples=4)
+    network, given = drawn(SbmcNetwork(4, 2, 1, 3), 0.4), sampled(5, 6, samples=4)
     assert given.samples is not None
     turned = given.replace(samples=given.samples[:, [2, 0, 3, 1]])
     torch.testing.assert_close(network(turned)[0].image, network(given)[0].image, rtol=1e-10, atol=1e-10)
@@ -29,7 +20,7 @@ def test_the_order_of_the_samples_does_not_matter() -> None:
 @torch.no_grad()
 def test_logits_of_any_size_leave_a_mean() -> None:
     """Exponentials of a thousand times what a number holds; equal samples come back as they are."""
-    network, given = drawn(), sampled(5, 6)
+    network, given = drawn(SbmcNetwork(4, 2, 1, 3), 0.4), sampled(5, 6)
     for layer in network.kernel:
         if isinstance(layer, nn.Conv2d):
             layer.weight *= 100

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
-from toys import Same, refused
+from toys import Same
 
 import mcdenoise
 from mcdenoise import Denoiser, Frame

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 import torch.nn.functional as F
-from test_cascaded import frame_of_doubles
 from torch import Tensor, nn
+from toys import drawn, frame_of
 
 from mcdenoise.models import Tiled, create_model
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.wskp import Reparameterized, WskpNetwork
-
-
-def drawn(network: nn.Module) -> Any:
-    torch.manual_seed(3)
-    for parameter in network.parameters():
-        nn.init.normal_(parameter, std=0.15)
-    return network.double()
 
 
 def branches(layer: Reparameterized, x: Tensor) -> Tensor:
@@ -60,7 +51,7 @@ def test_weights_that_steepen_the_maps_give_an_image() -> None:
     """Importances of thousands, of which the public code has an exponential that is infinite."""
     network = drawn(WskpNetwork())
     nn.init.normal_(network.layers[-1].branches[0].weight, std=300)
-    frame = frame_of_doubles(12, 20).to(torch.float32)
+    frame = frame_of(12, 20)
     importance, _ = network.float().maps(frame)
     assert importance.abs().max() > 1000
     image = network(frame)[0].image

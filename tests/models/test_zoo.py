@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
 from torch.utils import _pytree as pytree
-from toys import refused, small, whole_frame
+from toys import small, whole_frame
 
 from mcdenoise import Denoiser, create_model
 

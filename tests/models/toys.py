@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise import ops
-from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models import Accumulated, Demodulated, Exposed, Model, Needs, Output, Skipping, create_model
 from mcdenoise.models._registry import find_model
@@ -25,14 +23,6 @@ def report_of(output: Output) -> FrameReport:
     report = FrameReport()
     report.add(output.notes)
     return report
-
-
-def refused(action: Callable[[], object]) -> str:
-    """The message of an error, which must be one line."""
-    with pytest.raises(InputError) as error:
-        action()
-    assert "\n" not in str(error.value)
-    return str(error.value)
 
 
 def frame_of(height: int, width: int, batch: int = 1, seed: int = 0, **buffers: Any) -> Frame:
@@ -112,6 +102,14 @@ def cascade(**settings: Any) -> Any:
     """The paper's cascade, small, behind a history and :class:`Skipping`, whose settings these are."""
     (networks,) = parts_of(small("cascaded"), Exposed)
     return Demodulated(Accumulated(Skipping(networks, **settings))).eval()
+
+
+def drawn(network: nn.Module, std: float = 0.15) -> Any:
+    """The network with drawn weights in float64, so that every part of its equations has an effect."""
+    torch.manual_seed(3)
+    for parameter in network.parameters():
+        nn.init.normal_(parameter, std=std)
+    return network.double()
 
 
 class Same(nn.Module):
