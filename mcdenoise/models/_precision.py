@@ -113,7 +113,7 @@ def _measured(device: torch.device) -> float:
         torch.set_num_threads(1)
         try:
             for precision in PRECISIONS * _ROUNDS:
-                with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+                with computing_in(precision, device):
                     start = watch.mark()
                     F.conv2d(rounded if precision == "bfloat16" else image, weight, padding=1)
                     times[precision].append(watch.between(start, watch.mark()))

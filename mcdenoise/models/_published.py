@@ -74,25 +74,10 @@ def published(network: Callable[..., Model]) -> Callable[..., Model]:
 
     _, *settings = inspect.signature(as_published).parameters.values()
     accumulation = {each.name: each.replace(kind=each.KEYWORD_ONLY) for each in settings}
-    made.__signature__ = _with(network, *accumulation.values())  # type: ignore[attr-defined]
+    own = inspect.signature(network)
+    every = [*own.parameters.values(), *accumulation.values()]
+    made.__signature__ = own.replace(parameters=every)  # type: ignore[attr-defined]
     return made
-
-
-def demodulated(method: Callable[..., Model]) -> Callable[..., Model]:
-    """A constructor of a method on demodulated light, with the method's settings."""
-
-    @functools.wraps(method, updated=())
-    def made(**settings: Any) -> Model:
-        return Demodulated(method(**settings))
-
-    made.__signature__ = _with(method)  # type: ignore[attr-defined]
-    return made
-
-
-def _with(constructor: Callable[..., Model], *settings: inspect.Parameter) -> inspect.Signature:
-    """The signature of a constructor with further settings."""
-    own = inspect.signature(constructor)
-    return own.replace(parameters=[*own.parameters.values(), *settings])
 
 
 def check_odd(kernel_size: int) -> None:

@@ -42,9 +42,11 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
+from mcdenoise.models._history import Past
+from mcdenoise.models._interface import Model
 from mcdenoise.models._motion import surface_before
-from mcdenoise.models._published import demodulated
-from mcdenoise.models.svgf import BRIGHTEST, WINDOW, History, Svgf, variance_of
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.svgf import BRIGHTEST, WINDOW, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
 
 # Name in `frame.extra` of the samples of the frame before, shaded once more.
@@ -65,12 +67,12 @@ class Asvgf(Svgf):
         super().__init__(alpha=alpha)
         self.needs = replace(self.needs, uses=self.needs.uses | {GRADIENT})
 
-    def changed(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor:
+    def changed(self, frame: Frame, past: Past, motion: Tensor | None) -> Tensor:
         """Lambda: the fraction of the history to discard.
 
         Args:
             frame: the current frame.
-            history: of the frame before.
+            past: of the frame before.
             motion: to the frame before, see :func:`mcdenoise.ops.reproject`.
 
         Returns:
@@ -81,8 +83,7 @@ class Asvgf(Svgf):
         if shaded is not None:
             now, before, there = shaded.split(1, 1)
             return temporal_gradient(now, before, there, None, *surface)
-        moments = torch.cat([history.moments, history.length.to(history.moments.dtype)], 1)
-        found, weight = reproject(moments, motion, surface_before(frame), history.surface)
+        found, weight = reproject(past.image[:, -3:], motion, surface_before(frame), past.surface)
         moments, length = found[:, :2], found[:, 2:].clamp_min(1)
         current = luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(moments.dtype)
         spatial = moments_variance(current, *surface, kernel_size=WINDOW)
@@ -91,17 +92,19 @@ class Asvgf(Svgf):
         noise = noise.clamp_max(BRIGHTEST**2 / 100)
         return temporal_gradient(current[:, :1], moments[:, :1], weight, noise, *surface)
 
-    def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _blend(self, frame: Frame, entering: Tensor, past: Past, motion: Tensor | None) -> tuple[Tensor, Tensor]:
         """Light and moments with as much of their history as still holds, and its length."""
-        both, length = super()._blend(frame, entering, history, motion)
-        change = self.changed(frame, history, motion).to(both.dtype)
+        both, length = super()._blend(frame, entering, past, motion)
+        change = self.changed(frame, past, motion).to(both.dtype)
         # (1 - lambda) (alpha c + (1 - alpha) h) + lambda c.
         return torch.lerp(both, entering, change), 1 / (change + (1 - change) / length)
 
 
-asvgf = register_model(
-    "asvgf",
-    "SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.",
-    kind="filter",
-    paper="Schied et al. 2018",
-)(demodulated(Asvgf))
+@register_model("asvgf", kind="filter", paper="Schied et al. 2018")
+def asvgf(*, alpha: float = 0.1) -> Model:
+    """SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.
+
+    Args:
+        alpha: see :class:`Asvgf`.
+    """
+    return Demodulated(Asvgf(alpha=alpha))

@@ -10,8 +10,6 @@ Direct and indirect light are not separated here, and there is no antialiasing a
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
@@ -19,37 +17,19 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._entries import register_model
-from mcdenoise.models._history import reset_of
-from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._history import Past, reset_of
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._motion import motion_to_previous, surface_before
-from mcdenoise.models._published import demodulated
 from mcdenoise.models._state import own_state
-from mcdenoise.ops import Surface, accumulate, atrous, luminance_moments, moments_variance
+from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.ops import accumulate, atrous, luminance_moments, moments_variance
 
 # With fewer frames, moments over time hardly determine the variance.
 _FEW_FRAMES, WINDOW = 4, 7
 LEVELS = 5  # of the a-trous transform, whose taps lie 1, 2, 4, ... pixels apart
 # Brighter light counts as this in the moments, so that float32 can represent the square.
 BRIGHTEST = 1e18
-
-
-class History(NamedTuple):
-    """The history of a shot.
-
-    Args:
-        light: ``(B, 3 + C, H, W)`` light, accumulated and filtered once, then layers and alpha.
-        moments: ``(B, 2, H, W)`` accumulated moments of the luminance.
-        length: ``(B, 1, H, W)`` in frames.
-        surface: the surfaces that the last frame shows.
-        view_projection: ``(B, 4, 4)`` camera of the last frame.
-    """
-
-    light: Tensor
-    moments: Tensor
-    length: Tensor
-    surface: Surface
-    view_projection: Tensor | None
 
 
 class Svgf(nn.Module):
@@ -73,43 +53,33 @@ class Svgf(nn.Module):
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)
         entering = with_carried(frame)
-        history = own_state(state, History, frame, channels=entering.shape[1])
-        normal, depth = frame.normal, frame.depth
-        reset = reset_of(frame, history and history.length, history and history.view_projection)
-        motion = None if history is None or reset else motion_to_previous(frame, history.view_projection)
-        light, moments, length = self._accumulate(frame, entering, None if reset else history, motion)
+        # Light that was accumulated and filtered once, with layers and alpha; two moments; and the length, in frames.
+        past = own_state(state, Past, frame, channels=entering.shape[1] + 3, keeper="svgf")
+        reset = reset_of(frame, past and past.image, past and past.view_projection)
+        light, moments, length = self._accumulate(frame, entering, None if reset else past)
         variance = variance_of(moments, length, frame)
         filtered, kept = light, light
         for level in range(LEVELS):
-            filtered, variance = atrous(filtered, variance, normal, depth, step=1 << level)  #             Eqs. 1 and 2
+            filtered, variance = atrous(filtered, variance, frame.normal, frame.depth, step=1 << level)  #  Eqs. 1 and 2
             # Sec. 4.3: the first level feeds the history.
             kept = filtered if level == 0 else kept
-        surface = Surface(frame.position, normal, depth)
-        after = History(kept, moments, length, surface, frame.view_projection)
         output = answered(frame, filtered).noted(Note("history", reset))
+        after = Past.of(frame, torch.cat([kept, moments, length], 1))
         return output._replace(stages={"accumulated": light[:, :3]}), after
 
-    def _accumulate(
-        self, frame: Frame, light: Tensor, history: History | None, motion: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _accumulate(self, frame: Frame, light: Tensor, past: Past | None) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
         entering = torch.cat([light, luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
-        if history is None:
+        if past is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
-        both, length = self._blend(frame, entering, history, motion)
+        both, length = self._blend(frame, entering, past, motion_to_previous(frame, past.view_projection))
         return both[:, :-2], both[:, -2:], length
 
-    def _blend(self, frame: Frame, entering: Tensor, history: History, motion: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _blend(self, frame: Frame, entering: Tensor, past: Past, motion: Tensor | None) -> tuple[Tensor, Tensor]:
         """Light and moments with their history, and its length."""
-        return accumulate(
-            entering,
-            torch.cat([history.light, history.moments], 1),
-            history.length,
-            motion,
-            surface_before(frame),
-            history.surface,
-            alpha_min=self.alpha,
-        )
+        before, length = past.image[:, :-1], past.image[:, -1:]
+        surfaces = surface_before(frame), past.surface
+        return accumulate(entering, before, length, motion, *surfaces, alpha_min=self.alpha)
 
 
 def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
@@ -124,9 +94,11 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
     return torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
 
 
-svgf = register_model(
-    "svgf",
-    "Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.",
-    kind="filter",
-    paper="Schied et al. 2017",
-)(demodulated(Svgf))
+@register_model("svgf", kind="filter", paper="Schied et al. 2017")
+def svgf(*, alpha: float = 0.2) -> Model:
+    """Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.
+
+    Args:
+        alpha: see :class:`Svgf`.
+    """
+    return Demodulated(Svgf(alpha=alpha))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
+from mcdenoise.models._history import Past
 from mcdenoise.models.svgf import Svgf
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
 
@@ -29,6 +30,11 @@ def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Fram
     return Frame(**{**buffers, **changes})
 
 
+def kept(state: Past) -> tuple[Tensor, ...]:
+    """Light, moments and length."""
+    return state.image.split([3, 2, 1], 1)
+
+
 def test_noise_falls_in_space_and_in_time() -> None:
     """The first frame is smoother than accumulation alone is after as many as its weight allows: nine."""
     denoiser = Denoiser("svgf")
@@ -45,9 +51,9 @@ def test_the_weight_of_a_frame_is_one_over_their_number_down_to_alpha() -> None:
     for number in range(1, 9):
         _, state = model(lit if number == 1 else dark, state)
         rest *= 1 if number == 1 else 1 - max(1 / number, 0.2)
-        expected = rest * torch.tensor([2.0, 4.0]).reshape(1, 2, 1, 1).expand_as(state.moments)
-        torch.testing.assert_close(state.moments, expected)
-        assert state.length.unique().tolist() == [number]
+        _, moments, length = kept(state)
+        torch.testing.assert_close(moments, rest * torch.tensor([2.0, 4.0]).reshape(1, 2, 1, 1).expand_as(moments))
+        assert length.unique().tolist() == [number]
 
 
 def test_the_first_level_feeds_the_history() -> None:
@@ -58,7 +64,7 @@ def test_the_first_level_feeds_the_history() -> None:
     for level in range(5):
         light, variance = atrous(light, variance, given.normal, given.depth, step=2**level)
         if level == 0:
-            torch.testing.assert_close(state.light, light)
+            torch.testing.assert_close(kept(state)[0], light)
     torch.testing.assert_close(output.image, light)
     assert torch.equal(output.stages["accumulated"], given.color)
 
@@ -68,8 +74,9 @@ def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None
     noise = frame()
     model, state, images = Svgf(), None, []
     for _ in range(6):
-        kept = None if state is None else state._replace(light=noise.color)
-        output, state = model(noise, kept)
+        if state is not None:
+            state = state._replace(image=torch.cat([noise.color, *kept(state)[1:]], 1))
+        output, state = model(noise, state)
         images.append(output.image)
     for image in images[:3]:
         assert image.var() < 0.2 * noise.color.var()
@@ -115,7 +122,7 @@ def test_motion_comes_from_positions_and_cameras_too() -> None:
             if positions:
                 given = given.replace(motion=None)
             output, state = model(given, state)
-        results.append((output.image, state.length))
+        results.append((output.image, kept(state)[2]))
     torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-3, atol=1e-3)
     # The pixels that came into view at the right have no history, and the corner moves over the wall.
     assert results[0][1][..., -2:].unique().tolist() == [1.0]
