@@ -98,8 +98,8 @@ class Oidn(Filters):
         self, quality: Quality = "high", auxiliary: Auxiliary = "noisy", *, threads: int | None = None
     ) -> None:
         super().__init__(quality)
-        _check("quality", quality, Quality)
-        _check("auxiliary", auxiliary, Auxiliary)
+        check_choice("quality", quality, Quality)
+        check_choice("auxiliary", auxiliary, Auxiliary)
         if threads is not None and threads < 1:
             raise InputError(f"threads: expected at least 1, found {threads}")
         self._oidn = _import_oidn()
@@ -199,7 +199,7 @@ def oidn(
     Raises:
         InputError: see :class:`Oidn`.
     """
-    _check("source", source, Source)
+    check_choice("source", source, Source)
     denoiser = Oidn(quality, auxiliary, threads=threads)
     if source == "accumulated":
         return Chain(accumulated=accumulated(), denoised=denoiser)
@@ -216,7 +216,8 @@ def guides_of(frame: Frame) -> dict[str, Tensor]:
     return {name: image for name, image in given.items() if image is not None}
 
 
-def _check(name: str, value: str, known: Any) -> None:
+def check_choice(name: str, value: str, known: Any) -> None:
+    """``InputError`` for a setting that is none of a ``Literal``."""
     if value not in get_args(known):
         raise InputError(f"{name}: expected one of {', '.join(get_args(known))}, found '{value}'")
 

@@ -14,18 +14,18 @@ from typing import Literal
 
 from torch import Tensor
 
-from mcdenoise.errors import InputError
 from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model
 from mcdenoise.models.chain import Chain
-from mcdenoise.models.oidn import Quality
+from mcdenoise.models.oidn import Quality, check_choice
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.models.restored import Restored
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.models.with_oidn import OIDN_ALBEDO, Engine, WithOidn
 
+Auxiliary = Literal["both", "noisy"]
 # Weight of the image for clean features relative to that for noisy ones. On 74 frames of training data the errors of
 # weights from 2 to 8 differ by at most 1 %.
 _CLEAN_PART = 3.0
@@ -45,7 +45,7 @@ def mixed(oidn: Tensor, oidn_clean: Tensor | None = None) -> Tensor:
 def oidn_temporal(
     *,
     quality: Quality = "high",
-    auxiliary: Literal["both", "noisy"] = "both",
+    auxiliary: Auxiliary = "both",
     prefilter: Quality = "high",
     threads: int | None = None,
     engine: Engine = "auto",
@@ -66,8 +66,7 @@ def oidn_temporal(
     Raises:
         InputError: ``auxiliary`` is neither; otherwise see both classes.
     """
-    if auxiliary not in ("both", "noisy"):
-        raise InputError(f"auxiliary: expected both or noisy, found '{auxiliary}'")
+    check_choice("auxiliary", auxiliary, Auxiliary)
     both = auxiliary == "both"
     steadied = Recurrent(Tiled(Steadied(history)), albedo=OIDN_ALBEDO)
     chain = Chain(mixed=FromBuffers(mixed), steadied=steadied)

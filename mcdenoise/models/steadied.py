@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Needs, Output, State
-from mcdenoise.models._layers import answered
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.with_oidn import CENTRED, NOISY
 from mcdenoise.nn.oidn import oidn_exposure
@@ -80,7 +79,7 @@ class Steadied(nn.Module):
         n = self.history * same
         for window, doubt in zip(_WINDOWS, _DOUBTS, strict=True):
             n = n * torch.exp(-doubt * _relative(before, image, same, window, least) / noise)
-        return answered(frame, torch.lerp(image, before, n / (1 + n)), None), None
+        return Output(torch.lerp(image, before, n / (1 + n))), None
 
 
 def _relative(

@@ -15,18 +15,17 @@ with one sample a pixel, and more error than it saves.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.oidn import Filters, Oidn, Quality
+from mcdenoise.models.oidn import Filters, Oidn, Quality, check_choice
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.models.tiled import with_border, without_border
 from mcdenoise.noise import noise_is_spread
@@ -91,9 +90,8 @@ class WithOidn(Wrapper):
         clean: bool = True,
     ) -> None:
         super().__init__(inner)
-        for name, value, kind in (("engine", engine, Engine), ("prefilter", prefilter, Quality)):
-            if value not in get_args(kind):
-                raise InputError(f"{name}: expected one of {', '.join(get_args(kind))}, found '{value}'")
+        check_choice("engine", engine, Engine)
+        check_choice("prefilter", prefilter, Quality)
         self.quality, self.threads, self.engine = quality, threads, engine
         self.prefilter, self.clean = prefilter, clean
         self._library = Oidn(quality, threads=threads)

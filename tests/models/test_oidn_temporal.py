@@ -33,8 +33,6 @@ from mcdenoise.models.with_oidn import (
     OIDN_ALBEDO,
     OIDN_CLEAN,
     WithOidn,
-    _merged,
-    _phases,
     _without_pattern,
 )
 from mcdenoise.nn.oidn import oidn_exposure
@@ -128,16 +126,6 @@ def test_the_image_for_noisy_features_alone(quality: str) -> None:
     extra = model.before(exact).extra
     assert OIDN_CLEAN not in extra
     assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
-
-
-@pytest.mark.parametrize("size", [(6, 8), (5, 7)])
-def test_phases_are_every_second_pixel(size: tuple[int, int]) -> None:
-    image = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0))
-    phases = _phases(image)
-    for phase, (row, column) in enumerate(itertools.product((0, 1), repeat=2)):
-        part = image[..., row::2, column::2]
-        torch.testing.assert_close(phases[phase::4, :, : part.shape[-2], : part.shape[-1]], part)
-    torch.testing.assert_close(_merged(phases, size), image)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e4])
