@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from toys import frame_of
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -20,14 +21,7 @@ from mcdenoise.ops import demodulate, remodulate
 
 
 def frame(height: int = 36, width: int = 52, batch: int = 1, seed: int = 0) -> Frame:
-    generator = torch.Generator().manual_seed(seed)
-    albedo, light, normal = (torch.rand(batch, 3, height, width, generator=generator) for _ in range(3))
-    return Frame(
-        color=albedo * light * 5,
-        albedo=albedo,
-        normal=torch.nn.functional.normalize(normal - 0.5, dim=1),
-        motion=torch.zeros(batch, 2, height, width),
-    )
+    return frame_of(height, width, batch, seed, depth=None, motion=torch.zeros(batch, 2, height, width))
 
 
 def channels_last(image: Tensor) -> Tensor:

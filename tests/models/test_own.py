@@ -5,15 +5,16 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import torch
 from refusals import refused
 from torch import Tensor, nn
+from toys import Mean
 
 from mcdenoise import Denoiser, Frame, create_model
-from mcdenoise.models import Needs, Output, State
+from mcdenoise.models import Output, State
 
 SIZE = (24, 32)
 
@@ -146,26 +147,19 @@ def test_an_invalid_image_is_refused_in_one_line(function: Any, message: str) ->
     assert re.search(message, refused(lambda: Denoiser(function)(frame())))
 
 
-class Memory(NamedTuple):
-    mean: Tensor
-    count: Tensor
-
-
-class Mean(nn.Module):
+class Misbehaving(Mean):
     """The mean of all frames, where it does not misbehave in the second."""
 
-    needs = Needs()
-
-    def __init__(self, misbehave: str = "") -> None:
-        super().__init__()
-        self.misbehave = misbehave
+    misbehave = ""
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        count = torch.ones(1, 1, 1, 1) if state is None else state.count + 1
-        mean = frame.color if state is None else state.mean + (frame.color - state.mean) / count
-        wrong = {"structure": (mean, count), "kind": Memory(mean, 3), "device": Memory(mean.to("meta"), count)}
-        after = wrong.get(self.misbehave, Memory(mean, count)) if state is not None else Memory(mean, count)
-        return Output(mean), after
+        output, after = super().forward(frame, state)
+        wrong = {
+            "structure": tuple(after.values()),
+            "kind": {**after, "count": 3},
+            "device": {**after, "total": after["total"].to("meta")},
+        }
+        return output, after if state is None else wrong.get(self.misbehave, after)
 
 
 def test_a_state_is_carried_from_frame_to_frame() -> None:
@@ -183,7 +177,8 @@ def test_a_state_is_carried_from_frame_to_frame() -> None:
     ],
 )
 def test_an_invalid_state_is_refused_and_the_last_one_kept(misbehave: str, message: str) -> None:
-    model = Mean(misbehave)
+    model = Misbehaving()
+    model.misbehave = misbehave
     denoiser, frames = Denoiser(model), [frame() for _ in range(2)]
     denoiser(frames[0])
     assert message in refused(lambda: denoiser(frames[1]))
