@@ -8,7 +8,6 @@ import inspect
 import pkgutil
 import re
 from contextlib import suppress
-from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from importlib.metadata import Distribution, EntryPoint, distributions
 from types import BuiltinFunctionType
@@ -30,24 +29,25 @@ _FACTORY = "expected a factory, a function without required arguments that retur
 def list_models(pattern: str = "*") -> list[str]:
     """Sorted names of all registered models that match a shell-style pattern, including those of installed packages."""
     _import_pages()
-    return sorted(name for name in {*MODELS, *_offered().points} if fnmatch(name, pattern))
+    return sorted(name for name in {*MODELS, *_offered()[0]} if fnmatch(name, pattern))
 
 
 def troubles() -> list[str]:
     """One line for each installed package whose offer of models cannot be read, or is of a name that is taken."""
     _import_pages()
+    offers, wrong = _offered()
     taken = [
         f"{_named(point.dist)}: expected a name for its model that is not taken, found '{name}', which is not used"
-        for name, point in _offered().points.items()
+        for name, point in offers.items()
         if name in MODELS and MODELS[name].of_zoo
     ]
-    return taken + _offered().troubles
+    return taken + wrong
 
 
 def is_registered(name: str) -> bool:
     """Whether a name is that of a registered model, without importing code that a name could point to."""
     _import_pages()
-    return name in MODELS or name in _offered().points
+    return name in MODELS or name in _offered()[0]
 
 
 def find_model(name: str) -> Entry:
@@ -63,9 +63,9 @@ def find_model(name: str) -> Entry:
     _import_pages()
     if name in MODELS:
         return MODELS[name]
-    if name in (points := _offered().points):
-        with refused(f"model '{name}': the package {_named(points[name].dist)} offers it and cannot load it"):
-            return _of_factory(name, points[name].load())
+    if point := _offered()[0].get(name):
+        with refused(f"model '{name}': the package {_named(point.dist)} offers it and cannot load it"):
+            return _of_factory(name, point.load())
     known = list_models()
     if (match := re.fullmatch(r"([^()]+)\((.*)\)", name)) and (match[1] in known or ":" in match[1]):
         # On the command line, texts have no quotes.
@@ -169,28 +169,22 @@ def _import_pages() -> None:
             importlib.import_module(f"{room}.{page.name}")
 
 
-@dataclass(frozen=True)
-class _Offered:
-    """The entry points of installed packages in the group ``mcdenoise.models`` by name, and what is wrong with them."""
-
-    points: dict[str, EntryPoint] = field(default_factory=dict)
-    troubles: list[str] = field(default_factory=list)
-
-
 @functools.cache
-def _offered() -> _Offered:
-    found = _Offered()
+def _offered() -> tuple[dict[str, EntryPoint], list[str]]:
+    """The entry points of installed packages in the group ``mcdenoise.models`` by name, and what is wrong with them."""
+    offers: dict[str, EntryPoint] = {}
+    wrong: list[str] = []
     for package in distributions():
         # A package that cannot be read is in the way of no other, so each is read by itself.
         try:
             points = [point for point in package.entry_points if point.group == GROUP]
         except Exception as error:
-            found.troubles.append(f"{_named(package)}: entry points cannot be read: {in_one_line(error)}")
+            wrong.append(f"{_named(package)}: entry points cannot be read: {in_one_line(error)}")
             continue
         for point in points:
             # If there are two versions of a package, the one that Python finds first counts.
-            found.points.setdefault(point.name, point)
-    return found
+            offers.setdefault(point.name, point)
+    return offers, wrong
 
 
 def _named(package: Distribution | None) -> str:

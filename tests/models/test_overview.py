@@ -73,7 +73,7 @@ def test_a_kind_that_is_none_is_refused() -> None:
 
 def test_a_package_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint("theirs", "no_such_package:factory", "mcdenoise.models")
-    monkeypatch.setattr(_registry, "_offered", lambda: _registry._Offered({"theirs": point}))
+    monkeypatch.setattr(_registry, "_offered", lambda: ({"theirs": point}, []))
     (entry,) = overview("theirs")
     assert (entry.kind, entry.weights) == ("other", "none")
     assert "offers it and cannot load it" in entry.reason
