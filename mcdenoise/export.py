@@ -214,7 +214,7 @@ def export_model(
 
 
 def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterator[tuple[int, float]]:
-    """Compare onnxruntime running an exported graph with torch running the method, over the first five frames of a shot.
+    """Compare onnxruntime running an exported graph with torch running the method, over the first five frames.
 
     Args:
         exported: result of :func:`export_model`, in ONNX.

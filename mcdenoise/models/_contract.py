@@ -17,7 +17,6 @@ from mcdenoise.models._interface import Ask, Model, Needs, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._registry import needs_of_models
 from mcdenoise.models._weights import pretrained_models
-from mcdenoise.own import refused
 
 
 def checked_step(model: Model, frame: Frame, state: State, shape: tuple[int, ...], ask: Ask) -> tuple[Output, State]:
