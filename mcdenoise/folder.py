@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.files import check_writable, make_folder, remove, write_json
+from mcdenoise.data.files import check_writable, listed, make_folder, remove, write_json
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -319,30 +319,18 @@ def check_apart(sequence: Sequence, out: Path) -> None:
     """Raise an error if results, which have the names of the inputs, would overwrite inputs, also through a link."""
     inputs = {os.path.realpath(folder) for folder in (*sequence.folders, sequence.root)}
     # Inputs may themselves be links to files elsewhere.
-    inputs |= {os.path.realpath(path) for folder in sequence.folders for path in _links(folder)}
+    inputs |= {os.path.realpath(path) for folder in sequence.folders for path in listed(folder) if path.is_symlink()}
     if os.path.realpath(out) in inputs:
         raise InputError(
             f"{out}: expected another folder than that of the input, found the same; choose one to write to"
         )
-    for path in _links(out):
+    for path in filter(Path.is_symlink, listed(out)):
         target = os.path.realpath(path)
         if {target, os.path.dirname(target)} & inputs:
             raise InputError(
                 f"{path}: expected no link to an input, which would be written to, found one; remove it, or choose "
                 "another folder"
             )
-
-
-def _links(folder: Path) -> list[Path]:
-    """The symbolic links in a folder.
-
-    Raises:
-        InputError: the folder cannot be listed.
-    """
-    try:
-        return [path for path in folder.iterdir() if path.is_symlink()]
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def _of_earlier_runs(out: Path, written: Iterable[Path]) -> list[str]:

@@ -74,11 +74,16 @@ def unfinished(path: Path) -> Iterator[None]:
 def remove_unfinished() -> None:
     """Remove all incomplete files, as the last action of the process."""
     for path in list(_unfinished):
-        with suppress(OSError):
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink()
+        delete(path)
+
+
+def delete(path: Path) -> None:
+    """Remove a file, or a folder with its contents, if that is possible."""
+    with suppress(OSError):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
 
 
 @contextmanager

@@ -19,6 +19,8 @@ def check_file(path: Path) -> None:
     Raises:
         OSError: it is not; ``strerror`` says what it is.
     """
+    if os.path.islink(path) and not os.path.exists(path):
+        raise OSError(errno.ENOENT, "it is a link to nothing", str(path))
     mode = os.stat(path).st_mode
     if not stat.S_ISREG(mode):
         raise OSError(errno.EINVAL, "it is a folder" if stat.S_ISDIR(mode) else "it is a device or a pipe", str(path))

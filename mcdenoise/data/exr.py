@@ -10,7 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from mcdenoise.data.files import atomic_path
+from mcdenoise.data.files import atomic_path, cannot_write
 from mcdenoise.data.images import (
     LARGEST_PIXEL_COUNT,
     STORAGE_PREFIXES,
@@ -33,7 +33,6 @@ __all__ = [
     "Mask",
     "Metadata",
     "MetadataValue",
-    "cannot_write",
     "pending_error",
     "read_exr",
     "within_half",
@@ -123,11 +122,6 @@ def write_image(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> None:
     with atomic_path(path) as temporary:
         if reason := _write(temporary, spec, image).replace(str(temporary), path.name):
             raise cannot_write(path, reason)
-
-
-def cannot_write(path: Path, reason: str) -> InputError:
-    """The error of a file that cannot be written."""
-    return InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
 
 
 def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> str:

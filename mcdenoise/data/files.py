@@ -7,15 +7,14 @@ import math
 import os
 import platform
 import secrets
-import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from mcdenoise.errors import InputError
-from mcdenoise.interruption import unfinished
+from mcdenoise.interruption import delete, unfinished
 
 try:
     import fcntl
@@ -55,27 +54,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
         >>> path.read_text(), len(list(path.parent.iterdir()))
         ('1 2 3', 1)
     """
-    # Replace the target of a link, not the link, and never a device such as /dev/stdout.
-    target = Path(os.path.realpath(path))
-    if os.path.lexists(target) and not os.path.isfile(path):
-        raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
-    # Libraries choose the format by the suffix, so keep that of the given name, not of the link's target.
-    temporary = target.with_name(f"{_PREFIX}{secrets.token_hex(8)}{_MARK}{path.suffix[:64]}")
-    handle = -1
-    try:
-        with unfinished(temporary), _writing(path):
-            _sweep(target.parent)
-            handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
-            _lock(handle)
-            yield temporary
-            _to_disk(temporary)
-            os.replace(temporary, target)
-    finally:
-        # After a successful rename it no longer exists. A folder that forbids removing has also forbidden creating it.
-        with suppress(OSError):
-            os.unlink(temporary)
-        with suppress(OSError):
-            os.close(handle)
+    target, temporary = _beside(path)
+    with _temporary(path, temporary):
+        yield temporary
+        # Otherwise a power failure after the rename could leave an empty file.
+        with temporary.open("rb") as file:
+            os.fsync(file)
+        os.replace(temporary, target)
 
 
 @contextmanager
@@ -95,7 +80,20 @@ def held(folder: Path, work: str) -> Iterator[None]:
         ...     pass
     """
     path = folder / ".lock"
-    with _locked(path, folder, work) as file:
+    with ExitStack() as stack:
+        while True:
+            with _writing(path):
+                file = stack.enter_context(path.open("a+", encoding="utf-8"))
+            if fcntl is not None and not _lock(file.fileno()):
+                file.seek(0)
+                raise InputError(
+                    f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
+                    "wait for it, or choose another folder"
+                )
+            # The process that held the lock may have removed its file after this one had opened it.
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    break
         with _writing(path):
             file.truncate(0)
             file.write(f"process {os.getpid()} of {platform.node()} at work in it")
@@ -106,29 +104,6 @@ def held(folder: Path, work: str) -> Iterator[None]:
             if fcntl is not None:
                 with suppress(OSError):
                     path.unlink()
-
-
-def _locked(path: Path, folder: Path, work: str) -> IO[str]:
-    """Open and lock a lock file."""
-    while True:
-        with _writing(path):
-            file = path.open("a+", encoding="utf-8")
-        if fcntl is None:
-            return file
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # The process that held the lock may have removed its file after this one had opened it.
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    return file
-            file.close()
-        except BlockingIOError as error:
-            with file:
-                file.seek(0)
-                raise InputError(
-                    f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
-                    "wait for it, or choose another folder"
-                ) from error
 
 
 @contextmanager
@@ -157,23 +132,46 @@ def new_folder(path: Path) -> Iterator[Path]:
                 f"{path}: expected a new or an empty folder, found {'files in it' if exists else 'a file'}; choose "
                 "another folder, or remove what is there"
             )
-    temporary = (path if exists else path.parent).absolute() / f"{_PREFIX}{secrets.token_hex(8)}{_MARK}"
+    temporary = (path if exists else path.parent).absolute() / _name()
+    with _temporary(path, temporary, folder=True):
+        yield temporary
+        if exists:
+            for name in os.listdir(temporary):
+                os.rename(temporary / name, path / name)
+        else:
+            # This fails if a non-empty folder has been created there in the meantime.
+            os.rename(temporary, path)
+
+
+def _name() -> str:
+    """A name of an incomplete file that no other has."""
+    return f"{_PREFIX}{secrets.token_hex(8)}{_MARK}"
+
+
+def _beside(path: Path) -> tuple[Path, Path]:
+    """The file to write for a path, and an incomplete one beside it."""
+    # Replace the target of a link, not the link, and never a device such as /dev/stdout.
+    target = Path(os.path.realpath(path))
+    if os.path.lexists(target) and not os.path.isfile(path):
+        raise InputError(f"{path}: expected a file to write, found a folder or a device; choose another path")
+    # Libraries choose the format by the suffix, so keep that of the given name, not of the link's target.
+    return target, target.with_name(f"{_name()}{path.suffix[:64]}")
+
+
+@contextmanager
+def _temporary(path: Path, temporary: Path, *, folder: bool = False) -> Iterator[None]:
+    """Create and lock an incomplete file or folder for ``path``, and remove it unless it is renamed in the block."""
     handle = -1
     try:
         with unfinished(temporary), _writing(path):
-            temporary.mkdir(parents=True)
-            handle = os.open(temporary, os.O_RDONLY)
-            _lock(handle)
             _sweep(temporary.parent)
-            yield temporary
-            if exists:
-                for name in os.listdir(temporary):
-                    os.rename(temporary / name, path / name)
-            else:
-                # This fails if a non-empty folder has been created there in the meantime.
-                os.rename(temporary, path)
+            if folder:
+                temporary.mkdir(parents=True)
+            handle = os.open(temporary, os.O_RDONLY if folder else os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+            _lock(handle)
+            yield
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        delete(temporary)
         with suppress(OSError):
             os.close(handle)
 
@@ -240,12 +238,8 @@ def check_writable(path: Path) -> None:
     Raises:
         InputError: see :func:`atomic_path`.
     """
-    with suppress(_Tried), atomic_path(path):
-        raise _Tried
-
-
-class _Tried(Exception):
-    """Raised in place of writing, by :func:`check_writable`."""
+    with _temporary(path, _beside(path)[1]):
+        pass
 
 
 def remove(path: Path) -> None:
@@ -298,21 +292,26 @@ def _remove_unless_held(path: str) -> None:
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         try:
             if _lock(handle):
-                if os.path.isdir(path):
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    os.unlink(path)
+                delete(Path(path))
         finally:
             os.close(handle)
 
 
-def _to_disk(path: Path) -> None:
-    """Flush a file to the disk; otherwise a power failure after the rename could leave an empty file."""
-    handle = os.open(path, os.O_RDONLY)
+def listed(folder: Path) -> list[Path]:
+    """The entries of a folder, sorted by their names.
+
+    Raises:
+        InputError: it cannot be listed.
+    """
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        return [folder / name for name in sorted(os.listdir(folder))]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
+
+
+def cannot_write(path: Path, reason: str) -> InputError:
+    """The error of a file that cannot be written."""
+    return InputError(f"{path}: cannot be written ({reason}); check the folder, its permissions and free space")
 
 
 @contextmanager
@@ -321,7 +320,4 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(
-            f"{path}: cannot be written ({reason}); check the folder, its permissions and free space"
-        ) from error
+        raise cannot_write(path, error.strerror or type(error).__name__) from error

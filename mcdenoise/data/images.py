@@ -20,6 +20,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from mcdenoise.errors import InputError, is_unicode
+from mcdenoise.reading import check_file
 
 Image: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -90,29 +91,21 @@ class Part:
 
     Args:
         name: name of the part, empty if the file has none.
-        size: height and width of the data window in pixels.
-        origin: row and column of its first pixel in the display window.
+        window: the data window.
+        display: the display window.
         channels: names of the channels, R, G, B first.
         integers: channels that are stored as integers, such as object ids.
         display_referred: whether the pixels are display values, as in an 8-bit PNG.
-        display: height, width, first row and column of the display window.
         gamma: exponent of the display curve, if it is a power; 0 for the curve of sRGB.
     """
 
     name: str
-    size: tuple[int, int]
-    origin: tuple[int, int]
+    window: Window
+    display: Window
     channels: tuple[str, ...]
-    integers: frozenset[str]
-    display_referred: bool
-    display: tuple[int, int, int, int] = (0, 0, 0, 0)
+    integers: frozenset[str] = frozenset()
+    display_referred: bool = False
     gamma: float = 0.0
-
-    @property
-    def window(self) -> Window:
-        """The data window."""
-        (height, width), (top, left) = self.size, self.origin
-        return Window(top, left, top + height, left + width)
 
 
 @dataclass(frozen=True)
@@ -195,7 +188,7 @@ def _read(
     places = [part.channels.index(name) for name in names]
     first, end = min(places), max(places) + 1
     picked = [place - first for place in places]
-    height, width = part.size
+    height, width = part.window.size
     try:
         spec = file.spec(index)
         # All rows at once are decoded by several threads.
@@ -229,9 +222,10 @@ def _read(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[oiio.ImageInput, ImageHeader]]:
-    # Not Path.is_file, which raises an error for a name that is too long or a folder without access.
-    if not os.path.isfile(path):
-        raise InputError(f"{path}: expected an image, found {_what_is_at(path)}; check the path")
+    try:
+        check_file(path)
+    except OSError as error:
+        raise InputError(f"{path}: expected an image, found: {error.strerror}; check the path") from error
     check_name(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
@@ -287,15 +281,6 @@ def _png_is_whole(path: Path) -> bool:
     return not content.startswith(_PNG)
 
 
-def _what_is_at(path: Path) -> str:
-    """Describe what is at a path instead of a file, for messages."""
-    if os.path.isdir(path):
-        return "a folder"
-    if os.path.exists(path):
-        return "a device or a pipe"
-    return "a link to nothing" if os.path.lexists(path) else "no such file"
-
-
 def check_name(path: Path) -> None:
     """Reject a name that cannot be passed to OpenImageIO.
 
@@ -317,9 +302,7 @@ def _picture_metadata(spec: oiio.ImageSpec) -> Metadata:
     """The attributes that describe the picture rather than its storage."""
     kept: Metadata = {}
     for attribute in spec.extra_attribs:
-        value = attribute.value
-        if isinstance(value, str) and not value.isascii():
-            value = _as_text(value)
+        value = _as_text(attribute.value) if isinstance(attribute.value, str) else attribute.value
         if isinstance(value, tuple) and not all(isinstance(item, int | float) for item in value):
             continue
         if isinstance(value, str | int | float | tuple) and not attribute.name.startswith(STORAGE_PREFIXES):
@@ -329,11 +312,7 @@ def _picture_metadata(spec: oiio.ImageSpec) -> Metadata:
 
 def _as_text(text: str) -> str:
     """Decode bytes that are not UTF-8, and arrive as surrogates, as Latin-1, which old systems write."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return text.encode(errors="surrogateescape").decode("latin-1")
-    return text
+    return text if is_unicode(text) else text.encode(errors="surrogateescape").decode("latin-1")
 
 
 def pending_error(source: Any) -> str:
@@ -357,7 +336,7 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
             kinds = [str(kind) for kind in spec.channelformats] or [str(spec.format)] * spec.nchannels
             channels = tuple(spec.channelnames)
             metadata = metadata or _picture_metadata(spec)
-            part_name = _text(spec, "oiio:subimagename") or _text(spec, "name")
+            part_name = spec.get_string_attribute("oiio:subimagename") or spec.get_string_attribute("name")
             gamma = _gamma_of(spec) if name in ("png", "tiff") else None
         except UnicodeDecodeError as error:
             raise _refused(path, "names that are no text") from error
@@ -383,10 +362,10 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         # Floats, and files that say nothing, have the usual curve of their kind.
         usual = kinds[0] in ("uint8", "uint16") if gamma is None else gamma != 1
         display = name in ("png", "tiff") and usual
-        size, origin = (spec.height, spec.width), (spec.y, spec.x)
-        whole = (spec.full_height, spec.full_width, spec.full_y, spec.full_x)
+        window = Window(spec.y, spec.x, spec.y + spec.height, spec.x + spec.width)
+        whole = Window(spec.full_y, spec.full_x, spec.full_y + spec.full_height, spec.full_x + spec.full_width)
         gamma = gamma or 0.0 if display else 0.0
-        parts.append(Part(part_name, size, origin, channels, integers, display, whole, gamma))
+        parts.append(Part(part_name, window, whole, channels, integers, display, gamma))
         if name != "openexr":
             break
     pending_error(file)
@@ -395,22 +374,16 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
     return ImageHeader(name, tuple(parts), metadata)
 
 
-def _text(spec: oiio.ImageSpec, name: str) -> str:
-    """A text in a header; empty if there is none of that name, or something else."""
-    value = spec.getattribute(name)
-    return value if isinstance(value, str) else ""
-
-
 def _gamma_of(spec: oiio.ImageSpec) -> float | None:
     """Exponent of the curve that a file states: 1 for linear light, 0 for the curve of sRGB; ``None`` if none."""
     profile = spec.getattribute("ICCProfile")
     if isinstance(profile, np.ndarray) and (found := _gamma_of_profile(profile.tobytes())) is not None:
         return found if 0.1 < found < 10 else 0.0
-    space = _text(spec, "oiio:ColorSpace").lower()
+    space = spec.get_string_attribute("oiio:ColorSpace").lower()
     if "lin" in space:
         return 1.0
-    stated = spec.getattribute("oiio:Gamma")
-    gamma = stated if isinstance(stated, float) and 0.1 < stated < 10 else 0.0
+    stated = spec.get_float_attribute("oiio:Gamma")
+    gamma = stated if 0.1 < stated < 10 else 0.0
     # Without any statement, OpenImageIO says that a PNG is sRGB.
     return gamma if gamma or "srgb" in space else None
 

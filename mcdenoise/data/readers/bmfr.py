@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES
 from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, write_exr
-from mcdenoise.data.files import make_folder, write_text
+from mcdenoise.data.files import listed, make_folder, write_text
 from mcdenoise.data.images import read_image_header, read_picture
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, LIGHT_PARTS, SPECULAR
 from mcdenoise.data.readers.files import RenderedFiles, as_tensor
@@ -181,11 +181,7 @@ def noise_seed_folder(folder: Path, noise_seed: int) -> Path:
 
 def _list_files(path: Path) -> dict[str, dict[int, Path]]:
     found: dict[str, dict[int, Path]] = {name: {} for name in _STEMS}
-    try:
-        entries = sorted(os.listdir(path))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    for match in filter(None, map(_NAME.fullmatch, entries)):
+    for match in filter(None, (_NAME.fullmatch(each.name) for each in listed(path))):
         other = found[_BUFFER_OF[match[1]]].setdefault(int(match[2]), path / match[0])
         if other.name != match[0]:
             raise InputError(f"{path}: expected one file a frame, found {other.name} and {match[0]}; remove one")
@@ -333,7 +329,7 @@ def _is_whole(path: Path, size: tuple[int, int], channels: int, *_: int) -> bool
         part = read_picture(path)[1].parts[0]
     except InputError:
         return False
-    return part.size == size[::-1] and part.origin == (0, 0) and len(part.channels) == channels
+    return part.window == (0, 0, *size[::-1]) and len(part.channels) == channels
 
 
 CLEAN = "clean"

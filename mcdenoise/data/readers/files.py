@@ -82,7 +82,7 @@ class RenderedFiles(FrameSequence):
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
-        return self.part_of(self.choice.layers["color"]).size if self.window is None else self.window.size
+        return (self.window or self.part_of(self.choice.layers["color"]).window).size
 
     @property
     def buffers(self) -> frozenset[str]:

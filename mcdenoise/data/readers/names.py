@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcdenoise.data.files import listed
 from mcdenoise.data.images import FORMATS
 from mcdenoise.errors import InputError
 
@@ -46,7 +47,7 @@ def find_files(inputs: Sequence[Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for given in inputs:
         if os.path.isdir(given):
-            new = _listed(given)
+            new = _images_in(given)
         elif os.path.lexists(given):
             # It may be anything; opening it reports the error.
             new = [given]
@@ -56,12 +57,8 @@ def find_files(inputs: Sequence[Path]) -> list[Path]:
     return list(found)
 
 
-def _listed(folder: Path) -> list[Path]:
-    try:
-        names = sorted(os.listdir(folder))
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
-    return [folder / name for name in names if Path(name).suffix.lower() in FORMATS and not name.startswith(".")]
+def _images_in(folder: Path) -> list[Path]:
+    return [each for each in listed(folder) if each.suffix.lower() in FORMATS and not each.name.startswith(".")]
 
 
 def _matches(pattern: Path) -> list[Path]:
@@ -76,13 +73,13 @@ def _matches(pattern: Path) -> list[Path]:
         )
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
-    listed = _listed(folder)
+    images = _images_in(folder)
     # Brackets may be part of a file name; they are placeholders only if no such file exists.
     for translated in (re.escape, _translated) if wild else (re.escape,):
         expression = "".join(
             rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else translated(piece) for i, piece in enumerate(pieces)
         )
-        found = [path for path in listed if re.fullmatch(expression, path.name)]
+        found = [path for path in images if re.fullmatch(expression, path.name)]
         if found:
             break
     else:
@@ -180,7 +177,7 @@ def _oidn_groups(found: Iterable[tuple[Path, re.Match[str]]]) -> list[FileGroup]
 def files_beside(path: Path) -> dict[str, Path]:
     """The other images in a file's folder whose names have the same digits, by the rest of their names."""
     digits = _DIGITS.findall(path.stem)
-    others = [other for other in _listed(path.parent) if _DIGITS.findall(other.stem) == digits and other != path]
+    others = [other for other in _images_in(path.parent) if _DIGITS.findall(other.stem) == digits and other != path]
     return {" ".join(_DIGITS.split(other.stem)[::2]).strip(" ._-"): other for other in others}
 
 

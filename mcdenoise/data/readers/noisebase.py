@@ -12,7 +12,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -23,6 +23,7 @@ import torch
 
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Mask, Metadata, write_exr
+from mcdenoise.data.files import listed
 from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
@@ -276,8 +277,7 @@ class _NoisebaseFiles(FrameSequence):
 def find_zips(given: Sequence[Path]) -> list[Path]:
     """The zips among the given files, or in the given folder; empty if there are other files."""
     if len(given) == 1 and os.path.isdir(given[0]):
-        with suppress(OSError):
-            given = [given[0] / name for name in sorted(os.listdir(given[0])) if not name.startswith(".")]
+        given = [each for each in listed(given[0]) if not each.name.startswith(".")]
     return list(given) if all(path.suffix == SUFFIX for path in given) else []
 
 

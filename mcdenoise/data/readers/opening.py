@@ -225,7 +225,7 @@ def _check_window(path: Path, header: ImageHeader, layer: Layer, main: Part, one
 
 
 def _window(part: Part) -> str:
-    (height, width), (top, left) = part.size, part.origin
+    (height, width), (top, left) = part.window.size, part.window[:2]
     return f"{width} x {height} pixels" + (f" at {left}, {top}" if (top, left) != (0, 0) else "")
 
 
@@ -248,7 +248,7 @@ def _look_beside(shot: RenderedFiles) -> None:
 def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
     """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
     main, number = shot.part_of(shot.choice.layers["color"]), shot.numbers[0]
-    height, width = main.size
+    height, width = main.window.size
     same = [layer for layer in dict.fromkeys(layers) if shot.part_of(layer).window == main.window]
     same = [layer for layer in same if shot.has(layer, number)]
     found: defaultdict[Layer, list[Image]] = defaultdict(list)

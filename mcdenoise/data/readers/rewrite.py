@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-from mcdenoise.data.exr import LARGEST_HALF, Image, cannot_write, within_half, write_image
-from mcdenoise.data.files import atomic_path
+from mcdenoise.data.exr import LARGEST_HALF, Image, within_half, write_image
+from mcdenoise.data.files import atomic_path, cannot_write
 from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
 from mcdenoise.data.radiance import encode
 
@@ -104,7 +104,7 @@ def _write_exr(
         written = read_image_header(target).parts
         # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
         for index, each in enumerate(written):
-            read_channels(target, {index: each.channels}, slice(each.size[0] - 1, each.size[0]))
+            read_channels(target, {index: each.channels}, slice(-1, None))
     except Exception as error:
         return _first_line(error)
     return "" if len(written) == len(expected) else "incomplete"
@@ -139,7 +139,9 @@ def _first_line(error: Exception) -> str:
 def _is_whole(found: Any, part: Part) -> bool:
     """Whether the other library has read a part with all of its channels."""
     channels = found.channels
-    return set(channels) == set(part.channels) and all(each.pixels.shape == part.size for each in channels.values())
+    return set(channels) == set(part.channels) and all(
+        each.pixels.shape == part.window.size for each in channels.values()
+    )
 
 
 def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], stored: Part | None) -> None:

@@ -10,7 +10,7 @@ from pictures import save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
-from mcdenoise.data.images import Part, read_channels
+from mcdenoise.data.images import Part, Window, read_channels
 from mcdenoise.data.readers.layers import layers_of, recognise
 
 SIZE = (24, 32)
@@ -18,7 +18,7 @@ SIZE = (24, 32)
 
 def part(channels: str, name: str = "", integers: str = "") -> Part:
     names = tuple(each.replace("~", " ") for each in channels.split())
-    return Part(name, SIZE, (0, 0), names, frozenset(integers.split()), False)
+    return Part(name, Window(0, 0, *SIZE), Window(0, 0, *SIZE), names, frozenset(integers.split()))
 
 
 def found(channels: str, label: str = "render") -> dict[str, str]:
