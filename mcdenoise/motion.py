@@ -51,16 +51,19 @@ class Convention(NamedTuple):
         scale_x: factor of the first channel.
         scale_y: factor of the second channel.
         words: description.
+        swapped: whether the second channel is x, and the first one y.
     """
 
     scale_x: float
     scale_y: float
     words: str
+    swapped: bool = False
 
     def apply(self, motion: Image) -> Image:
         """Convert to ``(H, W, 2)`` pixels, y down; infinite where the stored value is huge or NaN."""
         with np.errstate(invalid="ignore", over="ignore"):
-            scaled: Image = motion[..., :2] * np.array([self.scale_x, self.scale_y], np.float32)
+            xy = motion[..., 1::-1] if self.swapped else motion[..., :2]
+            scaled: Image = xy * np.array([self.scale_x, self.scale_y], np.float32)
         return np.where(_is_known(scaled)[..., None], scaled, np.float32(np.inf))
 
     def moves(self, motion: Image, least: float) -> int:
@@ -139,10 +142,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
-    errors = {each: float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in candidates}
-    # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
-    best = min(errors, key=lambda each: errors[each] / (_BETTER if "half" in each.words else 1))
-    at_rest = float(np.mean([_mismatch(*pair, Convention(0, 0, "")) for pair in pairs]))
+    best, errors, at_rest = _compare(pairs, candidates)
     better = errors[best] < _BETTER * errors[given]
     # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
@@ -152,6 +152,18 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     # If the usual unit gives hardly any motion and another unit matches, the motion is in that unit.
     rescaled = moving < _LEAST_MOVING and abs(best.scale_x) != abs(given.scale_x)
     return (best, True) if rescaled or better else (given, True)
+
+
+def _compare(
+    pairs: Sequence[Pair], candidates: Sequence[Convention]
+) -> tuple[Convention, dict[Convention, float], float]:
+    """The best convention, the mean :func:`_mismatch` of each, and that of no motion."""
+    *errors, at_rest = (
+        float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in (*candidates, Convention(0, 0, ""))
+    )
+    found = dict(zip(candidates, errors, strict=True))
+    # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
+    return min(found, key=lambda each: found[each] / (_BETTER if "half" in each.words else 1)), found, at_rest
 
 
 def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Convention | None:
@@ -332,18 +344,16 @@ def doubt_motion(frame: Frame, before: Seen | None) -> str:
 
 def _contradiction(pair: Pair) -> str:
     """Why a motion cannot be right: another reading of it must be better than it and than no motion."""
-    now, before, motion = pair
-    read = [(each, motion) for each in conventions(motion.shape[:2], motion)]
-    swapped = motion[..., 1::-1]
-    read += [(each._replace(words=f"x and y swapped, {each.words}"), swapped) for each, _ in read[:4]]
-    if max(each.moves(as_stored, _MOVES) for each, as_stored in read) < _LEAST_MOVING:
-        return ""
-    errors = [_mismatch(now, before, as_stored, each) for each, as_stored in read]
-    at_rest = _mismatch(now, before, motion, Convention(0, 0, ""))
+    *_, motion = pair
     # The first one is the usual convention.
-    best = min(range(len(read)), key=lambda i: errors[i] / (_BETTER if "half" in read[i][0].words else 1))
-    if at_rest > _UNLIKE and errors[best] < _BETTER * errors[0] and errors[best] < _BETTER * at_rest:
-        return f"the frame before looks alike only if it is read as {read[best][0].words}"
+    usual, *others = conventions(motion.shape[:2], motion)
+    turned = [each._replace(words=f"x and y swapped, {each.words}", swapped=True) for each in (usual, *others[:3])]
+    candidates = [usual, *others, *turned]
+    if max(each.moves(motion, _MOVES) for each in candidates) < _LEAST_MOVING:
+        return ""
+    best, errors, at_rest = _compare([pair], candidates)
+    if at_rest > _UNLIKE and errors[best] < _BETTER * errors[usual] and errors[best] < _BETTER * at_rest:
+        return f"the frame before looks alike only if it is read as {best.words}"
     return ""
 
 

@@ -85,6 +85,9 @@ class Window(NamedTuple):
         return found
 
 
+_NOWHERE = Window(0, 0, 0, 0)
+
+
 @dataclass(frozen=True)
 class Part:
     """One image (part) of a file.
@@ -122,6 +125,10 @@ class ImageHeader:
     parts: tuple[Part, ...]
     metadata: Metadata
 
+    def part(self, index: int) -> Part:
+        """A part; one without channels if the file does not have it."""
+        return self.parts[index] if index < len(self.parts) else Part("", _NOWHERE, _NOWHERE, ())
+
 
 def read_image_header(path: Path) -> ImageHeader:
     """Read the headers of all parts of a file.
@@ -151,8 +158,7 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
     """
     with _opened(path) as (file, header):
         for part, names in wanted.items():
-            found = header.parts[part].channels if part < len(header.parts) else ()
-            check_channels(path, found, names)
+            check_channels(path, header.part(part).channels, names)
         return {part: _read(path, file, part, header.parts[part], names, rows) for part, names in wanted.items()}
 
 

@@ -248,9 +248,7 @@ def _find_noise_seeds(path: Path, numbers: Sequence[int], files: Files) -> list[
     return found
 
 
-def write_bmfr_frame(
-    folder: Path, number: int, frame: Frame, *, metadata: Mapping[str, MetadataValue] | None = None
-) -> None:
+def write_bmfr_frame(folder: Path, number: int, frame: Frame) -> None:
     """Write the buffers of one frame: 32-bit floats for positions (and depths beyond half's range), half for the rest.
 
     The color file is written last. A folder without ``camera.json`` gets one, which states that color is radiance.
@@ -260,7 +258,6 @@ def write_bmfr_frame(
         folder: folder to write to; created if it does not exist.
         number: frame number.
         frame: batch of 1. Infinite depths are stored as 0.
-        metadata: attributes for every file.
 
     Raises:
         InputError: a file cannot be written.
@@ -275,7 +272,7 @@ def write_bmfr_frame(
     buffers = dict(frame.items())
     for name in _STEMS:
         if name in buffers:
-            write_buffer(folder, number, name, buffers[name], metadata=metadata)
+            write_buffer(folder, number, name, buffers[name])
 
 
 def write_buffer(

@@ -38,7 +38,6 @@ def examine(shot: RenderedFiles, color_has_albedo: bool | None) -> dict[str, Ima
     """
     number, chosen = shot.numbers[0], dict(shot.choice.layers)
     images = shot.read_buffers(number, [n for n in chosen if n != "reference" or number in shot.reference_numbers])
-    shot.kept.clear()
     readings = {name: [shot.choice.reasons[name]] if name in shot.choice.reasons else [] for name in images}
     _examine_color(shot, images, readings["color"], color_has_albedo)
     if "albedo" in images:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -57,7 +57,6 @@ class RenderedFiles(FrameSequence):
         drops_positions: whether positions tell no more than a depth, or nothing.
         split: the layers of diffuse and specular light, if they add up to the color.
         samples: the layers of single samples, if their mean is the color.
-        kept: layers of some files, which need not be read again while a shot is being opened.
         more: the kinds of files for each further noise seed.
     """
 
@@ -73,7 +72,6 @@ class RenderedFiles(FrameSequence):
     drops_positions: bool = False
     split: Split = NO_SPLIT
     samples: SampleLayers = NO_SAMPLES
-    kept: dict[tuple[Path, Layer], Image] = field(default_factory=dict)
     more: Sequence[Sequence[FileGroup]] = ()
     # Whether a camera is found from positions where none is given, and data windows must not differ.
     fits_cameras: ClassVar[bool] = True
@@ -317,8 +315,7 @@ class RenderedFiles(FrameSequence):
 
     def read(self, number: int, layers: Iterable[Layer]) -> dict[Layer, Image]:
         """Read layers of one frame, opening each file once: linear light, in the window of all frames."""
-        # Once a shot is open, nothing is kept.
-        images = read_files(lambda layer: self.file(layer, number), layers, kept=self.kept or None)
+        images = read_files(lambda layer: self.file(layer, number), layers)
         return {layer: self._decoded(number, layer, pixels) for layer, pixels in images.items()}
 
     def read_buffers(self, number: int, names: Iterable[str]) -> dict[str, Image]:

@@ -169,27 +169,8 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
     return found
 
 
-def read_layers(path: Path, layers: Iterable[Layer], rows: slice = slice(None)) -> dict[Layer, Image]:
-    """Read some rows of layers of one file, opening it once.
-
-    Raises:
-        InputError: see :func:`mcdenoise.data.images.read_channels`.
-    """
-    wanted: dict[int, dict[str, int]] = {}
-    layers = list(layers)
-    for layer in layers:
-        places = wanted.setdefault(layer.part, {})
-        for channel in layer.channels:
-            places.setdefault(channel, len(places))
-    found = read_channels(path, {part: list(places) for part, places in wanted.items()}, rows)
-    return {layer: found[layer.part][..., [wanted[layer.part][c] for c in layer.channels]] for layer in layers}
-
-
 def read_files(
-    path_of: Callable[[Layer], Path],
-    layers: Iterable[Layer],
-    rows: slice = slice(None),
-    kept: dict[tuple[Path, Layer], Image] | None = None,
+    path_of: Callable[[Layer], Path], layers: Iterable[Layer], rows: slice = slice(None)
 ) -> dict[Layer, Image]:
     """Read some rows of layers, opening each file once.
 
@@ -197,25 +178,24 @@ def read_files(
         path_of: the file of a layer.
         layers: the layers.
         rows: contiguous rows of the data window.
-        kept: whole layers that have been read before; it gets those that are read now.
 
     Raises:
-        InputError: see :func:`read_layers`.
+        InputError: see :func:`mcdenoise.data.images.read_channels`.
     """
-    files: defaultdict[Path, list[Layer]] = defaultdict(list)
-    found: dict[Layer, Image] = {}
     layers = list(layers)
+    files: defaultdict[Path, list[Layer]] = defaultdict(list)
     for layer in layers:
-        path = path_of(layer)
-        if kept is not None and (path, layer) in kept:
-            found[layer] = kept[path, layer][rows]
-        else:
-            files[path].append(layer)
+        files[path_of(layer)].append(layer)
+    found: dict[Layer, Image] = {}
     for path, own in files.items():
-        new = read_layers(path, own, rows)
-        found |= new
-        if kept is not None and rows == slice(None):
-            kept |= {(path, layer): pixels for layer, pixels in new.items()}
+        channels: defaultdict[int, dict[str, None]] = defaultdict(dict)
+        for layer in own:
+            channels[layer.part] |= dict.fromkeys(layer.channels)
+        names = {part: [*each] for part, each in channels.items()}
+        pixels = read_channels(path, names, rows)
+        found |= {
+            layer: pixels[layer.part][..., [names[layer.part].index(each) for each in layer.channels]] for layer in own
+        }
     return {layer: found[layer] for layer in layers}
 
 

@@ -28,7 +28,7 @@ from mcdenoise.data.readers.diffuse_specular import (
 )
 from mcdenoise.data.readers.examining import examine, examine_parts
 from mcdenoise.data.readers.files import RenderedFiles
-from mcdenoise.data.readers.layers import Layer, layers_of, read_files, read_layers, recognise
+from mcdenoise.data.readers.layers import Layer, layers_of, read_files, recognise
 from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
 from mcdenoise.data.readers.samples import SampleLayers, split_samples
@@ -74,18 +74,17 @@ def open_files(
         for i, (group, header) in enumerate(zip(groups, headers, strict=True))
         for layer in layers_of(i, group.label, header.parts)
     ]
-    kept: dict[tuple[Path, Layer], Image] = {}
     samples, layers = split_samples(layers)
 
     def read(wanted: Sequence[Layer], rows: slice) -> dict[Layer, Image]:
-        return read_files(lambda layer: next(iter(groups[layer.group].files.values())), wanted, rows, kept)
+        return read_files(lambda layer: next(iter(groups[layer.group].files.values())), wanted, rows)
 
     choice = choose(where, layers, mapping, read)
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))
     parts = [_parts(header, color_space) for header in headers]
-    shot = make(groups, parts, choice, numbers=numbers, warnings=choice.warnings, kept=kept)
+    shot = make(groups, parts, choice, numbers=numbers, warnings=choice.warnings)
     everywhere = _check_files(shot, splits, samples)
     for own in shot.more:
         everywhere &= _check_files(replace(shot, groups=own), splits, samples)
@@ -150,7 +149,9 @@ def open_result(path: Path) -> Result:
         InputError: the file cannot be read, or its radiance cannot be determined.
     """
     parts = read_image_header(path).parts
-    chosen = choose(str(path), layers_of(0, "", parts), {}, functools.partial(read_layers, path))
+    chosen = choose(
+        str(path), layers_of(0, "", parts), {}, lambda wanted, rows: read_files(lambda _: path, wanted, rows)
+    )
     (layer, *_) = chosen.written
     return Result(path, layer, parts[layer.part])
 
@@ -184,40 +185,31 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
     used = dict.fromkeys([*written, *shot.choice.layers.values()])
     everywhere = samples.layers.union(*(split.layers for split in splits))
     files = {layer.group: shot.groups[layer.group].files for layer in (*used, *everywhere)}
-    windows: set[Window | None] = set()
+    windows: set[Window] = set()
     colors: set[Window] = set()
     for number in shot.numbers:
         headers = {group: read_image_header(own[number]) for group, own in files.items() if number in own}
-        found = {layer: _window_in(headers[layer.group], layer) for layer in used if layer.group in headers}
-        for layer, window in found.items():
-            _check_window(shot.file(layer, number), headers[layer.group], layer, main, shot.one_window)
-            if layer == shot.choice.layers.get("reference") and window != found[color]:
+        parts = {each: headers[each.group].part(each.part) for each in (*used, *everywhere) if each.group in headers}
+        window = parts[color].window
+        for layer in (each for each in used if each in parts):
+            _check_window(shot.file(layer, number), parts[layer], layer, main, shot.one_window)
+            if layer == shot.choice.layers.get("reference") and parts[layer].window != window:
                 raise InputError(
                     f"{shot.file(layer, number)}: expected a reference in the data window of the color, found another; "
                     "render it so, or leave it out with --map reference="
                 )
-        everywhere = {
-            layer
-            for layer in everywhere
-            if layer.group in headers and _window_in(headers[layer.group], layer) == found[color]
-        }
-        windows |= {*found.values()}
-        colors |= {window for layer in written if (window := found.get(layer)) is not None}
+        own = {layer: part for layer, part in parts.items() if {*layer.channels} <= {*part.channels}}
+        everywhere = {layer for layer in everywhere if layer in own and own[layer].window == window}
+        windows |= {parts[layer].window for layer in used if layer in parts}
+        colors |= {parts[layer].window for layer in written if layer in parts}
     if len(windows) > 1:
         shot.window = functools.reduce(Window.joined, colors)
     return everywhere
 
 
-def _window_in(header: ImageHeader, layer: Layer) -> Window | None:
-    """The data window of a layer; ``None`` if a file does not have it."""
-    part = header.parts[layer.part] if layer.part < len(header.parts) else None
-    return part.window if part is not None and {*layer.channels} <= {*part.channels} else None
-
-
-def _check_window(path: Path, header: ImageHeader, layer: Layer, main: Part, one_window: bool) -> None:
-    part = header.parts[layer.part] if layer.part < len(header.parts) else None
-    check_channels(path, () if part is None else part.channels, layer.channels)
-    if part is not None and part.window != main.window and (one_window or part.display != main.display):
+def _check_window(path: Path, part: Part, layer: Layer, main: Part, one_window: bool) -> None:
+    check_channels(path, part.channels, layer.channels)
+    if part.window != main.window and (one_window or part.display != main.display):
         raise InputError(
             f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
             "buffers and frames at one size, or crop them in one display window, or leave a buffer out with --map"

@@ -24,7 +24,7 @@ from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.files import as_tensor
-from mcdenoise.data.readers.layers import layers_of, read_layers
+from mcdenoise.data.readers.layers import layers_of, read_files
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.process import Blender
@@ -250,7 +250,7 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
     layers = {layer.title: layer for layer in listed}
     found: dict[str, Image] = {}
     for split in find_splits(listed, layers["Combined"], {})[:1] if with_parts else []:
-        found |= split.sums(read_layers(path, split.layers))
+        found |= split.sums(read_files(lambda _: path, split.layers))
     for name in _PASSES:
         layer = layers.get(name) or layers.get(_RENAMED.get(name, ""))
         if layer is None:
