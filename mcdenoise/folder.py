@@ -19,8 +19,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.data import Sequence
-from mcdenoise.data.exr import Image, Metadata
 from mcdenoise.data.files import check_writable, listed, make_folder, remove, write_json
+from mcdenoise.data.images import Image, Metadata
 from mcdenoise.data.readers.diffuse_specular import LIGHT_PARTS
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError

@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import make_folder, remove
+from mcdenoise.data.images import Metadata
 from mcdenoise.data.png import Picture, read_png, write_png
 from mcdenoise.data.video import check_video, write_video
 from mcdenoise.errors import InputError

@@ -20,8 +20,8 @@ from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
-from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import make_folder, new_folder
+from mcdenoise.data.images import Metadata
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError, MissingBufferError, in_one_line
 from mcdenoise.evaluate import USUAL, check_references, reference_noise

@@ -21,9 +21,8 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
-from mcdenoise.data.exr import Metadata
 from mcdenoise.data.files import make_folder
-from mcdenoise.data.images import FORMATS
+from mcdenoise.data.images import FORMATS, Metadata
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence, prepare_folder

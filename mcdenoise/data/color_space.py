@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
-from mcdenoise.data.exr import Metadata
+from mcdenoise.data.images import Metadata
 from mcdenoise.errors import InputError
 
 # Red, green, blue and white of Rec. 709 in OpenEXR's order; a file without the attribute has these primaries.

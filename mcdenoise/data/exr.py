@@ -12,33 +12,16 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.files import atomic_path, cannot_write
 from mcdenoise.data.images import (
-    LARGEST_PIXEL_COUNT,
     STORAGE_PREFIXES,
     Image,
-    Mask,
     Metadata,
     MetadataValue,
     check_name,
     pending_error,
-    read_channels,
-    read_image_header,
+    read_last_rows,
     read_picture,
 )
 from mcdenoise.errors import InputError
-
-__all__ = [
-    "LARGEST_HALF",
-    "LARGEST_PIXEL_COUNT",
-    "Image",
-    "Mask",
-    "Metadata",
-    "MetadataValue",
-    "pending_error",
-    "read_exr",
-    "within_half",
-    "write_exr",
-    "write_image",
-]
 
 LARGEST_HALF = 65504.0
 # Rows to convert and compress at a time: enough for all cores, and little compared with a large image.
@@ -142,11 +125,8 @@ def _write(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> str:
     reason = pending_error(file)
     if not file.close() or not written:
         return reason or "writing failed"
-    # OpenImageIO does not report a full disk for the last few kilobytes, so read them back. A PNG has checksums.
     try:
-        header = read_image_header(path)
-        if header.format != "png":
-            read_channels(path, {0: header.parts[0].channels}, slice(-1, None))
+        read_last_rows(path)
     except InputError as error:
         return f"incomplete: {error}"
     return ""

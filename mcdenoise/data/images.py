@@ -162,6 +162,20 @@ def read_channels(path: Path, wanted: Mapping[int, Sequence[str]], rows: slice =
         return {part: _read(path, file, part, header.parts[part], names, rows) for part, names in wanted.items()}
 
 
+def read_last_rows(path: Path) -> ImageHeader:
+    """Read the last row of each part of a file that has been written: the last kilobytes may lack on a full disk.
+
+    The libraries do not report that. Of a PNG, the header is enough, for which its checksums are compared.
+
+    Raises:
+        InputError: see :func:`read_channels`.
+    """
+    header = read_image_header(path)
+    for index, part in enumerate(header.parts if header.format != "png" else ()):
+        read_channels(path, {index: part.channels}, slice(-1, None))
+    return header
+
+
 def check_channels(path: Path, found: Sequence[str], wanted: Sequence[str]) -> None:
     """Check that a part has all channels that are wanted of it.
 

@@ -10,8 +10,8 @@ import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
-from mcdenoise.data.exr import Image, write_image
-from mcdenoise.data.images import FORMATS
+from mcdenoise.data.exr import write_image
+from mcdenoise.data.images import FORMATS, Image
 from mcdenoise.errors import InputError
 
 # Type of the stored numbers; those of whole numbers are display values.

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Sequential
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, count, pairwise
 from pathlib import Path
 
 from mcdenoise.data.images import FORMATS
@@ -126,13 +126,10 @@ def frame_numbers(path: Path | Sequential[Path], frames: str | None = None) -> l
 def with_unique_names(sequences: list[Sequence]) -> list[Sequence]:
     """Add numbers to duplicate names of sequences, so that tables and folders keep them apart."""
     unique: list[Sequence] = []
-    names: set[str] = set()
     for sequence in sequences:
-        name, number = sequence.name, 2
-        while name in names:
-            name, number = f"{sequence.name} ({number})", number + 1
-        names.add(name)
-        unique.append(replace(sequence, name=name))
+        names = chain([sequence.name], (f"{sequence.name} ({number})" for number in count(2)))
+        taken = {each.name for each in unique}
+        unique.append(replace(sequence, name=next(name for name in names if name not in taken)))
     return unique
 
 

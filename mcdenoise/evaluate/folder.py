@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.data.exr import Metadata
+from mcdenoise.data.images import Metadata
 from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser

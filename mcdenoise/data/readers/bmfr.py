@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES
-from mcdenoise.data.exr import LARGEST_HALF, Image, Mask, MetadataValue, read_exr, write_exr
+from mcdenoise.data.exr import LARGEST_HALF, read_exr, write_exr
 from mcdenoise.data.files import listed, make_folder, write_text
-from mcdenoise.data.images import read_image_header, read_picture
+from mcdenoise.data.images import Image, Mask, MetadataValue, read_image_header, read_picture
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, LIGHT_PARTS, SPECULAR
 from mcdenoise.data.readers.files import RenderedFiles, as_tensor
 from mcdenoise.data.readers.names import FileGroup, find_files

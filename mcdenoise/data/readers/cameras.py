@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import Image, Mask
+from mcdenoise.data.images import Image, Mask
 from mcdenoise.motion import NEAR, misses, sampled
 
 # Number of times that outliers are rejected.

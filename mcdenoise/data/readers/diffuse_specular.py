@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mcdenoise.data.exr import Image
+from mcdenoise.data.images import Image
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import KNOWN, PASSES, Light, color_of, difference, find_parts, is_same
 from mcdenoise.light import LARGEST_RADIANCE

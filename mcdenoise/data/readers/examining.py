@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array
-from mcdenoise.data.exr import Image, Mask
+from mcdenoise.data.images import Image, Mask
 from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.diffuse_specular import SPECULAR_ALBEDO, Split
 from mcdenoise.data.readers.files import RenderedFiles, world_to_camera

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
-from mcdenoise.data.exr import Image, Mask, Metadata
-from mcdenoise.data.images import EXR_SUFFIXES, Part, Window, read_image_header
+from mcdenoise.data.images import EXR_SUFFIXES, Image, Mask, Metadata, Part, Window, read_image_header
 from mcdenoise.data.radiance import decode
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice

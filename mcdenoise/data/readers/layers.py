@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from mcdenoise.data.exr import Image
-from mcdenoise.data.images import Part, read_channels
+from mcdenoise.data.images import Image, Part, read_channels
 from mcdenoise.frame import BUFFERS
 
 # Renderers' names of each buffer, in lower-case letters and digits, in order of preference; for Blender, Mitsuba, pbrt,
@@ -219,7 +218,7 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
         whole = recognise(replace(layer, name=last[:-1]))
         if whole is not None and whole[0] != "alpha":
             return whole[0], whole[1] + _HALF_RANK
-    words = [word.lower() for word in _WORD.findall(last)]
+    words = _words(last)
     starts = [(words[start:], words[:start]) for start in range(len(words))]
     # A file name may also begin with the buffer.
     ends: list[tuple[list[str], list[str]]] = (
@@ -228,7 +227,9 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     for said, before in starts + ends:
         found = _RANKS.get("".join(said))
         # `albedoA` is not an alpha: a short name must be the whole word.
-        if found is None or (len(said) < len(words) and len("".join(said)) < 3 and said[0] not in _split(last)):
+        if found is None or (
+            len(said) < len(words) and len("".join(said)) < 3 and said[0] not in re.split(r"[^a-z0-9]+", last.lower())
+        ):
             continue
         buffer, rank = found
         if _OTHERS & set(before) or (
@@ -242,19 +243,19 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     return None
 
 
+def _words(name: str) -> list[str]:
+    return [word.lower() for word in _WORD.findall(name)]
+
+
 def usual(layer: Layer) -> int:
     """Place of a layer among those of one rank; smaller for names that stand further ahead in :data:`NAMES`."""
-    return _USUAL.get("".join(word.lower() for word in _WORD.findall(layer.title)), len(_USUAL))
+    return _USUAL.get("".join(_words(layer.title)), len(_USUAL))
 
 
 def is_about_a_buffer(layer: Layer) -> bool:
     """Whether a layer's name denotes a property of a buffer other than the color, such as ``albedoVariance``."""
-    words = [word.lower() for word in _WORD.findall(layer.title)]
+    words = _words(layer.title)
     return bool(_ABOUT & set(words[-1:])) and any("".join(words[i:-1]) in _RANKS for i in range(len(words) - 1))
-
-
-def _split(name: str) -> list[str]:
-    return re.split(r"[^a-z0-9]+", name.lower())
 
 
 def fits(buffer: str, layer: Layer) -> bool:

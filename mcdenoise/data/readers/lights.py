@@ -6,53 +6,39 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import NamedTuple
 
 import numpy as np
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import Image
+from mcdenoise.data.images import Image
 from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError
 
 ALL = "all"
 
 
-class Passes(NamedTuple):
-    """A renderer's layers of light, which add up to its color.
-
-    Args:
-        diffuse: names of layers of diffuse light.
-        others: names of layers of all other light.
-        specular_albedo: name of the color of glossy reflection, if there is one.
-    """
-
-    diffuse: tuple[str, ...]
-    others: tuple[str, ...]
-    specular_albedo: str = ""
-
-
-def _passes(diffuse: str, others: str, specular_albedo: str = "") -> Passes:
-    return Passes(tuple(diffuse.split(", ")), tuple(others.split(", ")), specular_albedo)
-
-
-# Blender to 4.5, Blender from 5.0 on, Arnold, RenderMan, LuxCore.
-PASSES = (
-    _passes("DiffDir, DiffInd", "GlossDir, GlossInd, TransDir, TransInd, VolumeDir, VolumeInd, Emit, Env", "GlossCol"),
-    _passes(
-        "Diffuse Direct, Diffuse Indirect",
-        "Glossy Direct, Glossy Indirect, Transmission Direct, Transmission Indirect, "
-        "Volume Direct, Volume Indirect, Emission, Environment",
-        "Glossy Color",
-    ),
-    _passes(
-        "diffuse_direct, diffuse_indirect, sss_direct, sss_indirect",
-        "specular_direct, specular_indirect, coat_direct, coat_indirect, sheen_direct, sheen_indirect, "
-        "transmission_direct, transmission_indirect, volume_direct, volume_indirect, emission, background",
-        "specular_albedo",
-    ),
-    _passes("directDiffuse, indirectDiffuse, subsurface", "directSpecular, indirectSpecular, transmissive, emissive"),
-    _passes("DIRECT_DIFFUSE, INDIRECT_DIFFUSE", "DIRECT_GLOSSY, INDIRECT_GLOSSY, INDIRECT_SPECULAR, EMISSION"),
+# For each renderer, whose layers of light add up to its color: names of layers of diffuse light, of layers of all other
+# light, and of the color of glossy reflection, if there is one. Blender to 4.5, Blender from 5.0 on, Arnold, RenderMan,
+# LuxCore.
+PASSES = tuple(
+    (diffuse.split(", "), others.split(", "), specular_albedo)
+    for diffuse, others, specular_albedo in (
+        ("DiffDir, DiffInd", "GlossDir, GlossInd, TransDir, TransInd, VolumeDir, VolumeInd, Emit, Env", "GlossCol"),
+        (
+            "Diffuse Direct, Diffuse Indirect",
+            "Glossy Direct, Glossy Indirect, Transmission Direct, Transmission Indirect, "
+            "Volume Direct, Volume Indirect, Emission, Environment",
+            "Glossy Color",
+        ),
+        (
+            "diffuse_direct, diffuse_indirect, sss_direct, sss_indirect",
+            "specular_direct, specular_indirect, coat_direct, coat_indirect, sheen_direct, sheen_indirect, "
+            "transmission_direct, transmission_indirect, volume_direct, volume_indirect, emission, background",
+            "specular_albedo",
+        ),
+        ("directDiffuse, indirectDiffuse, subsurface", "directSpecular, indirectSpecular, transmissive, emissive", ""),
+        ("DIRECT_DIFFUSE, INDIRECT_DIFFUSE", "DIRECT_GLOSSY, INDIRECT_GLOSSY, INDIRECT_SPECULAR, EMISSION", ""),
+    )
 )
 # Blender divides light by the surface color: `DiffDir` times `DiffCol` is the additive part.
 _DIVIDED = {
@@ -65,7 +51,7 @@ _DIVIDED = {
     for way in ways
 }
 # All layers of light with known names, which ``all`` tries first.
-KNOWN = {title for passes in PASSES for title in (*passes.diffuse, *passes.others)}
+KNOWN = {title for diffuse, others, _ in PASSES for title in (*diffuse, *others)}
 _ADDED = KNOWN | _DIVIDED.keys()
 _MATTES = ("Crypto", "crypto", "Debug", "Index", "Material Index", "Object Index")
 # Smallest color by which light is divided.

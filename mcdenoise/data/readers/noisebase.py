@@ -22,8 +22,9 @@ import numpy as np
 import torch
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import LARGEST_PIXEL_COUNT, Image, Mask, Metadata, write_exr
+from mcdenoise.data.exr import write_exr
 from mcdenoise.data.files import listed
+from mcdenoise.data.images import LARGEST_PIXEL_COUNT, Image, Mask, Metadata
 from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence

@@ -14,8 +14,16 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import find_camera_matrices
-from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.images import ImageHeader, Part, Window, check_channels, read_channels, read_image_header
+from mcdenoise.data.images import (
+    Image,
+    ImageHeader,
+    Metadata,
+    Part,
+    Window,
+    check_channels,
+    read_channels,
+    read_image_header,
+)
 from mcdenoise.data.radiance import decode
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
@@ -149,10 +157,8 @@ def open_result(path: Path) -> Result:
         InputError: the file cannot be read, or its radiance cannot be determined.
     """
     parts = read_image_header(path).parts
-    chosen = choose(
-        str(path), layers_of(0, "", parts), {}, lambda wanted, rows: read_files(lambda _: path, wanted, rows)
-    )
-    (layer, *_) = chosen.written
+    chosen = choose(str(path), layers_of(0, "", parts), {}, functools.partial(read_files, lambda _: path))
+    layer = chosen.written[0]
     return Result(path, layer, parts[layer.part])
 
 

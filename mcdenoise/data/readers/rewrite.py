@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import OpenEXR
 
-from mcdenoise.data.exr import LARGEST_HALF, Image, within_half, write_image
+from mcdenoise.data.exr import LARGEST_HALF, within_half, write_image
 from mcdenoise.data.files import atomic_path, cannot_write
-from mcdenoise.data.images import FORMATS, Part, read_channels, read_image_header, read_picture
+from mcdenoise.data.images import FORMATS, Image, Part, read_image_header, read_last_rows, read_picture
 from mcdenoise.data.radiance import encode
 
 # Names of the channels that DWA compression rounds, and its usual level.
@@ -101,10 +101,7 @@ def _write_exr(
     try:
         file.write(str(target))
         _put_back(target, originals)
-        written = read_image_header(target).parts
-        # OpenEXR does not report a full disk for the last few kilobytes, so read them back.
-        for index, each in enumerate(written):
-            read_channels(target, {index: each.channels}, slice(-1, None))
+        written = read_last_rows(target).parts
     except Exception as error:
         return _first_line(error)
     return "" if len(written) == len(expected) else "incomplete"

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mcdenoise.data.exr import LARGEST_HALF, Image, write_exr
+from mcdenoise.data.exr import LARGEST_HALF, write_exr
+from mcdenoise.data.images import Image
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import difference, is_same
 

@@ -12,8 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from torch import Tensor
 
-from mcdenoise.data.exr import Image, Metadata
-from mcdenoise.data.images import Window
+from mcdenoise.data.images import Image, Metadata, Window
 from mcdenoise.data.readers.lights import Light
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError

@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F
 
 from mcdenoise.data.camera_matrices import Array
-from mcdenoise.data.exr import LARGEST_HALF, Image, Mask
+from mcdenoise.data.exr import LARGEST_HALF
+from mcdenoise.data.images import Image, Mask
 
 # Larger than any scene's depth; placeholders of renderers are larger still: 1e10 (Blender), 1e30, 3.4e38.
 _FARTHEST = 1e9

@@ -19,8 +19,7 @@ import numpy as np
 from torch import Tensor
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
-from mcdenoise.data.exr import Image
-from mcdenoise.data.images import read_channels, read_image_header
+from mcdenoise.data.images import Image, read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.files import as_tensor
