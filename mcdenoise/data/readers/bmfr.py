@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -76,14 +76,6 @@ class _BmfrFolder(RenderedFiles):
     one_window = True
 
     @property
-    def folders(self) -> set[Path]:
-        return {self.path}
-
-    @property
-    def noise_seeds(self) -> int:
-        return 1 + len(self.more)
-
-    @property
     def noisy(self) -> frozenset[str]:
         """Names of the buffers that differ between noise seeds, as :meth:`frame` returns them."""
         parts = {name: lights[0].layers[0] for name, lights in self.split.parts.items()}
@@ -101,11 +93,6 @@ class _BmfrFolder(RenderedFiles):
     def _files(self, number: int) -> list[Path]:
         description = self.path / _DESCRIPTION
         return super()._files(number) + ([description] if description.is_file() else [])
-
-    def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
-        if noise_seed:
-            return replace(self, groups=self.more[noise_seed - 1])._frame(number, reference, 0, buffers)
-        return super()._frame(number, reference, 0, buffers)
 
     def as_frame(self, number: int, images: dict[str, Image], lights: Mapping[str, Image]) -> Frame:
         if not self.color_has_albedo:

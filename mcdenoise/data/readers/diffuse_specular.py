@@ -19,7 +19,7 @@ import numpy as np
 
 from mcdenoise.data.images import Image
 from mcdenoise.data.readers.layers import Layer
-from mcdenoise.data.readers.lights import KNOWN, PASSES, Light, color_of, difference, find_parts, is_same
+from mcdenoise.data.readers.lights import KNOWN, PASSES, Light, difference, find_parts, is_same, light_of
 from mcdenoise.light import LARGEST_RADIANCE
 
 DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission", "specular_albedo"
@@ -110,7 +110,7 @@ def find_splits(layers: Sequence[Layer], color: Layer, mapped: Mapping[str, Laye
     found: list[Split] = []
     for diffuse, others, gloss in PASSES:
         parts = {
-            name: tuple(Light((titles[t], *color_of(titles[t], own))) for t in names if t in titles)
+            name: tuple(light_of(titles[t], own) for t in names if t in titles)
             for name, names in ((DIFFUSE, diffuse), (SPECULAR, others))
         }
         if all(parts.values()):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -98,6 +98,11 @@ class RenderedFiles(FrameSequence):
         return frozenset(present | self.split.names | ({"samples"} if self.samples.radiance else set()))
 
     @property
+    def noise_seeds(self) -> int:
+        """Number of noisy colors per frame."""
+        return 1 + len(self.more)
+
+    @property
     def folders(self) -> set[Path]:
         """The folders of the files."""
         return {path.parent for group in self.groups for path in group.files.values()}
@@ -138,6 +143,8 @@ class RenderedFiles(FrameSequence):
         return as_tensor(self.read_buffers(number, ["reference"])["reference"])
 
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
+        if noise_seed:
+            return replace(self, groups=self.more[noise_seed - 1])._frame(number, reference, 0, buffers)
         split = self.split if buffers is None or self.split.names & set(buffers) else NO_SPLIT
         samples = self.samples if buffers is None or "samples" in buffers else NO_SAMPLES
         names = [

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from itertools import islice
 
 import numpy as np
 
@@ -206,9 +207,10 @@ def _is_other(layer: Layer) -> bool:
     return layer.title in _DIVIDED.values() or layer.title.startswith(_MATTES)
 
 
-def color_of(layer: Layer, layers: Sequence[Layer]) -> list[Layer]:
-    """The color by which a layer of light is divided, if there is one."""
-    return [each for each in layers if each.title == _DIVIDED.get(layer.title) and each.family == layer.family][:1]
+def light_of(layer: Layer, layers: Sequence[Layer]) -> Light:
+    """A layer of light, with the color by which it is divided, if there is one among other layers."""
+    colors = (each for each in layers if each.title == _DIVIDED.get(layer.title) and each.family == layer.family)
+    return Light((layer, *islice(colors, 1)))
 
 
 def find_lights(
@@ -236,11 +238,11 @@ def find_lights(
     """
     own = [layer for layer in layers if (layer.family == color.family or layer.anonymous) and layer != color]
     known = [layer for layer in own if layer.is_color and recognise(layer) is None]
-    pixels = read([color, *known, *(each for layer in known for each in color_of(layer, own))]) if names else {}
+    pixels = read([color, *(each for layer in known for each in light_of(layer, own).layers)]) if names else {}
 
     def radiance(chosen: Sequence[Layer]) -> dict[str, Image]:
         """The pixels of lights, as far as they have been read."""
-        parts = [Light((layer, *color_of(layer, own))) for layer in chosen]
+        parts = [light_of(layer, own) for layer in chosen]
         return {each.layers[0].name: each.radiance(pixels) for each in parts if {*each.layers} <= {*pixels}}
 
     expanded: list[str] = []
@@ -266,7 +268,7 @@ def find_lights(
                 f"{', '.join(map(str, found)) or 'none'}; {_advice(name, known)}"
             )
         (layer,) = found
-        lights[layer.name] = Light((layer, *color_of(layer, own)))
+        lights[layer.name] = light_of(layer, own)
     images = radiance([light.layers[0] for light in lights.values()])
     whole = bool(lights) and images.keys() == lights.keys()
     return lights, left_of(pixels[color], [*images.values()]) if whole else None

@@ -24,7 +24,7 @@ import torch
 from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import write_exr
 from mcdenoise.data.files import listed
-from mcdenoise.data.images import LARGEST_PIXEL_COUNT, Image, Mask, Metadata
+from mcdenoise.data.images import LARGEST_PIXEL_COUNT, Image, Mask
 from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
@@ -232,10 +232,6 @@ class _NoisebaseFiles(FrameSequence):
 
     def _files(self, number: int) -> list[Path]:
         return [self.zips[number]]
-
-    def _metadata(self, number: int) -> Metadata:
-        # The arrays have no attributes.
-        return {}
 
     def opened(self, number: int) -> AbstractContextManager[_Arrays]:
         """The arrays of one frame."""

@@ -76,18 +76,15 @@ def open_files(
     Raises:
         InputError: the files cannot be recognised, do not match one another, or cannot be read.
     """
-    headers = [read_image_header(next(iter(group.files.values()))) for group in groups]
+    first_files = [next(iter(group.files.values())) for group in groups]
+    headers = [*map(read_image_header, first_files)]
     layers = [
         replace(layer, files=pattern_of(group))
         for i, (group, header) in enumerate(zip(groups, headers, strict=True))
         for layer in layers_of(i, group.label, header.parts)
     ]
     samples, layers = split_samples(layers)
-
-    def read(wanted: Sequence[Layer], rows: slice) -> dict[Layer, Image]:
-        return read_files(lambda layer: next(iter(groups[layer.group].files.values())), wanted, rows)
-
-    choice = choose(where, layers, mapping, read)
+    choice = choose(where, layers, mapping, functools.partial(read_files, lambda layer: first_files[layer.group]))
     color = choice.layers["color"]
     splits = _splits(layers, choice, mapping)
     numbers = choose_numbers(sorted(groups[color.group].files))

@@ -240,8 +240,9 @@ class Sequence(ABC):
     def _files(self, number: int) -> list[Path]:
         """The files of one frame without those that hold only its reference, and the files that describe all frames."""
 
-    @abstractmethod
-    def _metadata(self, number: int) -> Metadata: ...
+    def _metadata(self, number: int) -> Metadata:
+        # Arrays have no attributes.
+        return {}
 
     @abstractmethod
     def _reference(self, number: int) -> Tensor: ...
