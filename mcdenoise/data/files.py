@@ -87,8 +87,8 @@ def held(folder: Path, work: str) -> Iterator[None]:
             if fcntl is not None and not _lock(file.fileno()):
                 file.seek(0)
                 raise InputError(
-                    f"{folder}: expected a folder that no other {work} writes to, found {file.read(200).strip()}; "
-                    "wait for it, or choose another folder"
+                    f"{folder}: expected a folder that no other {work} writes to, found "
+                    f"{file.read(200).strip() or 'its lock'}; wait for it, or choose another folder"
                 )
             # The process that held the lock may have removed its file after this one had opened it.
             with suppress(FileNotFoundError):

@@ -67,11 +67,6 @@ class Window(NamedTuple):
         """Height and width."""
         return self.bottom - self.top, self.right - self.left
 
-    def joined(self, other: Window) -> Window:
-        """The smallest window with both."""
-        low, high = map(min, self[:2], other[:2]), map(max, self[2:], other[2:])
-        return Window(*low, *high)
-
     def of(self, image: Image, own: Window, fill: float = 0.0) -> Image:
         """The pixels of this window, from an ``(H, W, C)`` image of another; filled where that has none."""
         if self == own:

@@ -206,7 +206,8 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
         windows |= {parts[layer].window for layer in used if layer in parts}
         colors |= {parts[layer].window for layer in written if layer in parts}
     if len(windows) > 1:
-        shot.window = functools.reduce(Window.joined, colors)
+        tops, lefts, bottoms, rights = zip(*colors, strict=True)
+        shot.window = Window(min(tops), min(lefts), max(bottoms), max(rights))
     return everywhere
 
 

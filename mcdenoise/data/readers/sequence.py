@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 from collections.abc import Sequence as Sequential
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Self
 
 import numpy as np
 from torch import Tensor
@@ -20,7 +20,6 @@ from mcdenoise.frame import Frame
 
 # Files may contain any values, also infinite ones, which are checked when a frame is used: suppress numpy's warnings.
 any_values = np.errstate(over="ignore", invalid="ignore", divide="ignore")
-_Self = TypeVar("_Self", bound="Sequence")
 
 
 class Denoised(NamedTuple):
@@ -112,7 +111,7 @@ class Sequence(ABC):
         self._check(number)
         return sorted(set(self._files(number)))
 
-    def part(self: _Self, numbers: Sequential[int]) -> _Self:
+    def part(self, numbers: Sequential[int]) -> Self:
         """Select some frames, ascending; how the values are read does not change."""
         for number in numbers:
             self._check(number)
