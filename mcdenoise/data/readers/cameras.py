@@ -69,8 +69,8 @@ def fit_camera(position: Image | Array, seen: Mask) -> FittedCamera | None:
         return None
     if np.median(homogeneous @ matrix[:, 2]) < 0:
         matrix = -matrix
-    world = np.concatenate([np.diag([1 / scale] * 3), -center[None] / scale])
-    world = np.concatenate([world, [[0.0], [0.0], [0.0], [1.0]]], 1)
+    world = np.diag([1 / scale] * 3 + [1.0])
+    world[3, :3] = -center / scale
     matrix = world @ matrix
     axis = np.linalg.norm(matrix[:3, 2])
     # For an orthographic camera w is constant, so it is not the depth.

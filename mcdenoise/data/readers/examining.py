@@ -90,11 +90,10 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
     color = np.nan_to_num(images["color"][..., :3])
-    features = {"albedo": albedo, "normal": np.nan_to_num(images["normal"]) if "normal" in images else None}
-    given = {name: None if image is None else _as_tensor(image) for name, image in features.items()}
+    given = (albedo, np.nan_to_num(images["normal"]) if "normal" in images else None)
     # Once a shot: to load the compiled form would take longer than plain torch does.
     with use("torch"):
-        spread = noise_is_spread(_as_tensor(color), **given)
+        spread = noise_is_spread(_as_tensor(color), *(None if each is None else _as_tensor(each) for each in given))
     if spread:
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "

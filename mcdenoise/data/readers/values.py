@@ -83,9 +83,8 @@ def albedo_included(color: Image, albedo: Image) -> Albedo:
             )
     roots = [np.sqrt(np.sqrt(np.maximum(image.mean(-1), 0))) for image in (albedo, color)]
     sums.append(_slopes(roots[0], roots[1], usable, relative=True))
-    stripes = np.stack(sums, 0)
     # Weight each estimate by its inverse variance.
-    found = [_jackknife(each) for each in stripes]
+    found = [_jackknife(each) for each in sums]
     weights = np.array([1 / max(error, 1e-3) ** 2 if np.isfinite(error) else 0.0 for _, error in found])
     if not weights.sum():
         return Albedo(None, float("nan"), float("inf"))
@@ -150,14 +149,12 @@ def _slopes(x: Image, y: Image, usable: Mask, *, relative: bool = False) -> Arra
     inside, xs, ys = (_blocks(np.where(usable, image, 0)) for image in (np.ones_like(x), x, y))
     count = np.maximum(inside.sum(1, keepdims=True), 1)
     mean_x, mean_y = xs.sum(1, keepdims=True) / count, ys.sum(1, keepdims=True) / count
+    within = (inside > 0) & (count > _BLOCK**2 / 2)
     if relative:
+        within &= (mean_x > 0) & (mean_y > 0)
         with np.errstate(divide="ignore", invalid="ignore"):
             xs, ys = np.nan_to_num(xs / mean_x), np.nan_to_num(ys / mean_y)
-        known = (mean_x[:, 0] > 0) & (mean_y[:, 0] > 0)
-        mean_x, mean_y = np.ones_like(mean_x), np.ones_like(mean_y)
-    else:
-        known = np.ones(len(xs), bool)
-    within = (inside > 0) & known[:, None] & (count > _BLOCK**2 / 2)
+        mean_x = mean_y = np.ones_like(mean_x)
     dx, dy = np.where(within, xs - mean_x, 0), np.where(within, ys - mean_y, 0)
     pairs = np.stack([(dx * dy).sum(1), (dx * dx).sum(1)], 1)
     # Blocks that are uniform up to rounding and feature noise carry no information.
