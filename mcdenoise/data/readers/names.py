@@ -74,23 +74,17 @@ def _matches(pattern: Path) -> list[Path]:
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
     images = _images_in(folder)
+    # At least as many digits as there are hash marks, or as the format says.
+    digits = [each.count("#") or int(each.strip("%d") or 1) or 1 for each in pieces[1::2]]
     # Brackets may be part of a file name; they are placeholders only if no such file exists.
     for translated in (re.escape, _translated) if wild else (re.escape,):
-        expression = "".join(
-            rf"[0-9]{{{_least_digits(piece)},9}}" if i % 2 else translated(piece) for i, piece in enumerate(pieces)
+        texts = iter([translated(each) for each in pieces[::2]])
+        expression = next(texts) + "".join(
+            f"[0-9]{{{least},9}}{text}" for least, text in zip(digits, texts, strict=True)
         )
-        found = [path for path in images if re.fullmatch(expression, path.name)]
-        if found:
-            break
-    else:
-        raise InputError(f"{pattern}: expected files with such names, found none; check the pattern")
-    return found
-
-
-def _least_digits(placeholder: str) -> int:
-    if placeholder.startswith("#"):
-        return len(placeholder)
-    return int(placeholder.strip("%d") or 1) or 1
+        if found := [path for path in images if re.fullmatch(expression, path.name)]:
+            return found
+    raise InputError(f"{pattern}: expected files with such names, found none; check the pattern")
 
 
 def _translated(text: str) -> str:
