@@ -81,17 +81,14 @@ def write_exr(
     spec = oiio.ImageSpec(width, height, count, "float" if full_float else "half")
     spec.channelnames = tuple(channels)
     for name, value in (metadata or {}).items():
-        if not name.startswith(STORAGE_PREFIXES):
-            _set_attribute(spec, name, value)
+        if name.startswith(STORAGE_PREFIXES):
+            continue
+        if isinstance(value, tuple):
+            spec.attribute(name, oiio.TypeDesc(_TUPLE_TYPES.get(name, f"float[{len(value)}]")), value)
+        else:
+            spec.attribute(name, value)
     spec.attribute("compression", "zip")
     write_image(path, spec, image)
-
-
-def _set_attribute(spec: oiio.ImageSpec, name: str, value: MetadataValue) -> None:
-    if isinstance(value, tuple):
-        spec.attribute(name, oiio.TypeDesc(_TUPLE_TYPES.get(name, f"float[{len(value)}]")), value)
-    else:
-        spec.attribute(name, value)
 
 
 def write_image(path: Path, spec: oiio.ImageSpec, image: NDArray[Any]) -> None:
