@@ -8,7 +8,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from mcdenoise.evaluate import METRICS, USUAL, measure
+from mcdenoise.evaluate import METRICS, USUAL, Scores
 from mcdenoise.results import Spread
 
 
@@ -25,9 +25,7 @@ class Errors:
     def __init__(self, metrics: Collection[str] = USUAL) -> None:
         self.skipped: dict[str, str] = {}
         self._metrics = {name: METRICS[name] for name in METRICS if name in metrics}
-        # Number, image and reference of the last frame of each method.
-        self._last: dict[str, tuple[int, Tensor, Tensor]] = {}
-        self._values: dict[str, dict[str, list[float]]] = {}
+        self._scores: dict[str, Scores] = {}
 
     @torch.inference_mode()
     def add(self, method: str, number: int, image: Tensor, reference: Tensor) -> None:
@@ -39,12 +37,7 @@ class Errors:
             image: ``(1, 3, H, W)`` scene-linear radiance.
             reference: of the same shape, on the same device.
         """
-        last = self._last.get(method)
-        before = last[1:] if last is not None and last[0] == number - 1 else None
-        values = self._values.setdefault(method, {})
-        for name, value in measure(self._metrics, image, reference, before, self.skipped).items():
-            values.setdefault(name, []).append(value)
-        self._last[method] = number, image, reference
+        self._scores.setdefault(method, Scores(skipped=self.skipped)).add(self._metrics, number, image, reference)
 
     def means(self, method: str) -> dict[str, float]:
         """Mean of each metric; metrics with infinite values are skipped, such as the PSNR of a perfect image."""
@@ -55,5 +48,5 @@ class Errors:
         return {name: Spread.of(values) for name, values in self._finite(method).items()}
 
     def _finite(self, method: str) -> dict[str, list[float]]:
-        values = self._values.get(method, {})
-        return {name: own for name, own in values.items() if all(math.isfinite(value) for value in own)}
+        columns = self._scores[method].columns if method in self._scores else {}
+        return {name: own for name, own in columns.items() if all(math.isfinite(value) for value in own)}

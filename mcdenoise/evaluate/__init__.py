@@ -3,7 +3,7 @@
 from mcdenoise.evaluate.folder import Evaluation, Table, evaluate_folder, evaluate_method, find_images
 from mcdenoise.evaluate.halves import Halves, evaluate_halves
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
-from mcdenoise.evaluate.scores import METRICS, USUAL, check_references, measure
+from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references, measure
 from mcdenoise.metrics import Metric
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "Evaluation",
     "Halves",
     "Metric",
+    "Scores",
     "Table",
     "check_references",
     "evaluate_folder",

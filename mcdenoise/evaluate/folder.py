@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate.noise import noise_floor, reference_noise
-from mcdenoise.evaluate.scores import METRICS, USUAL, check_references, measure
+from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references
 from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import (
@@ -46,41 +45,29 @@ _STILL = 0.05
 
 
 @dataclass
-class Table:
+class Table(Scores):
     """Values of one protocol.
 
     Args:
+        frames: see :class:`Scores`.
+        skipped: see :class:`Scores`.
         description: how the protocol computes its values.
-        frames: values by frame number and metric; a temporal metric is listed at the later frame of its pair.
-        skipped: reasons why a metric could not be computed, or not for every frame.
         shots: metrics of whole shots, with their number of frames.
     """
 
-    description: str
-    frames: dict[int, dict[str, float]] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
+    description: str = ""
     shots: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
     def mean(self) -> dict[str, float]:
         """Mean over the frames, by metric, and the metrics of whole shots."""
-        return {name: sum(own) / len(own) for name, own in self._columns().items()} | {
-            name: value for name, (value, _) in self.shots.items()
-        }
+        return super().mean | {name: value for name, (value, _) in self.shots.items()}
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of frames in each mean."""
-        return {name: len(own) for name, own in self._columns().items()} | {
-            name: count for name, (_, count) in self.shots.items()
-        }
-
-    def _columns(self) -> dict[str, list[float]]:
-        columns: dict[str, list[float]] = defaultdict(list)
-        for values in self.frames.values():
-            for name, value in values.items():
-                columns[name].append(value)
-        return columns
+        frames = {name: len(own) for name, own in self.columns.items()}
+        return frames | {name: count for name, (_, count) in self.shots.items()}
 
 
 @dataclass
@@ -241,18 +228,13 @@ def _evaluate(
     on_frame: Callable[[int], None],
 ) -> Evaluation:
     """Evaluate images, each with its number, frame and reference."""
-    tables = {name: Table(PROTOCOLS[name].description) for name in dict.fromkeys((STRICT, protocol))}
+    tables = {name: Table(description=PROTOCOLS[name].description) for name in dict.fromkeys((STRICT, protocol))}
     pairs = _Pairs(tables[STRICT])
-    last: tuple[int, Tensor, Tensor] | None = None
     for number, image, frame, reference in images:
-        before = last[1:] if last is not None and last[0] == number - 1 else None
         for name, table in tables.items():
-            used = sequence.numbers[PROTOCOLS[name].skipped_frames :]
-            if number in used:
-                pair = before if number - 1 in used else None
-                table.frames[number] = measure(_metrics(name), image, reference, pair, table.skipped)
-        pairs.add(number, frame, image, reference, before)
-        last = number, image, reference
+            if number in sequence.numbers[PROTOCOLS[name].skipped_frames :]:
+                table.add(_metrics(name), number, image, reference)
+        pairs.add(number, frame, image, reference)
         on_frame(number)
     pairs.finish()
     for name, table in tables.items():
@@ -276,26 +258,25 @@ class _Pairs:
 
     def __init__(self, table: Table) -> None:
         self._table = table
-        self._frame: Frame | None = None
+        self._last: tuple[int, Frame, Tensor, Tensor] | None = None
         self._warping: list[tuple[float, float]] = []
         self._flicker: Flicker | None = None
         self._shots: list[Flicker] = []
 
-    def add(
-        self, number: int, frame: Frame, image: Tensor, reference: Tensor, before: tuple[Tensor, Tensor] | None
-    ) -> None:
-        """Add the next frame; ``before`` is the image and the reference of the previous frame."""
-        last, self._frame = self._frame, frame
-        motion = None
-        if before is not None and last is not None:
-            motion = motion_to_previous(frame, last.view_projection)
-            if motion is None:
-                self._table.skipped[WARPED] = "the frames have no motion, and no positions with cameras"
-        if motion is None or before is None or last is None:
+    def add(self, number: int, frame: Frame, image: Tensor, reference: Tensor) -> None:
+        """Add the next frame."""
+        last, self._last = self._last, (number, frame, image, reference)
+        if last is None or last[0] != number - 1:
             self._flicker = None
             return
-        surface, previous = surface_before(frame), Surface(last.position, last.normal, last.depth)
-        clip, truth = torch.stack([before[0], image], 1), torch.stack([before[1], reference], 1)
+        _, old, *before = last
+        motion = motion_to_previous(frame, old.view_projection)
+        if motion is None:
+            self._table.skipped[WARPED] = "the frames have no motion, and no positions with cameras"
+            self._flicker = None
+            return
+        surface, previous = surface_before(frame), Surface(old.position, old.normal, old.depth)
+        clip, truth = (torch.stack(pair, 1) for pair in zip(before, (image, reference), strict=True))
         try:
             value = float(warped_rmse_srgb(clip, truth, motion, surface, previous))
             self._table.frames[number][WARPED] = value

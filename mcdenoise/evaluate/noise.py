@@ -10,7 +10,7 @@ import torch
 
 from mcdenoise.data import Sequence
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate.scores import METRICS, measure
+from mcdenoise.evaluate.scores import METRICS, Scores
 from mcdenoise.reading import read_text
 
 _NOISE_EPSILON = 0.01
@@ -45,19 +45,14 @@ def noise_floor(sequence: Sequence, *, metrics: Collection[str] = ("SMAPE", "tSM
         Mean by metric, over the frames or pairs of successive frames whose noise is recorded; empty if there are none.
         Metrics that cannot be computed are skipped.
     """
-    values: dict[str, list[float]] = {}
-    previous = None
-    noise = _recorded_noise(sequence)
-    for number, smape in noise.items():
+    scores, chosen = Scores(), {name: METRICS[name] for name in metrics}
+    for number, smape in _recorded_noise(sequence).items():
         truth = sequence.reference(number)
         generator = torch.Generator().manual_seed(number)
         deviation = smape * math.sqrt(math.pi / 2) * (2 * truth + _NOISE_EPSILON)
         noisy = (truth + deviation * torch.randn(truth.shape, generator=generator)).clamp_min(0)
-        chosen = {name: METRICS[name] for name in metrics}
-        for name, value in measure(chosen, truth, noisy, previous if number - 1 in noise else None).items():
-            values.setdefault(name, []).append(value)
-        previous = truth, noisy
-    return {name: sum(own) / len(own) for name, own in values.items()}
+        scores.add(chosen, number, truth, noisy)
+    return scores.mean
 
 
 def _recorded_noise(sequence: Sequence) -> dict[int, float]:

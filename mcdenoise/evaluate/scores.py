@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -66,6 +68,40 @@ def measure(
             if skipped is not None:
                 skipped[name] = str(error)
     return values
+
+
+@dataclass
+class Scores:
+    """Values of metrics frame by frame; of the images it stores only the last one.
+
+    Args:
+        frames: values by frame number and metric; a temporal metric is listed at the later frame of its pair.
+        skipped: reasons why a metric could not be computed, or not for every frame.
+    """
+
+    frames: dict[int, dict[str, float]] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    _last: tuple[int, Tensor, Tensor] | None = field(default=None, init=False)
+
+    def add(self, metrics: Mapping[str, Metric], number: int, image: Tensor, reference: Tensor) -> None:
+        """Compute the metrics of the next frame; temporal ones only if the last one is the frame before it."""
+        previous = self._last[1:] if self._last is not None and self._last[0] == number - 1 else None
+        self.frames[number] = measure(metrics, image, reference, previous, self.skipped)
+        self._last = number, image, reference
+
+    @property
+    def columns(self) -> dict[str, list[float]]:
+        """The values of each metric, in the order of the frames."""
+        columns: dict[str, list[float]] = defaultdict(list)
+        for values in self.frames.values():
+            for name, value in values.items():
+                columns[name].append(value)
+        return columns
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean over the frames, by metric."""
+        return {name: sum(own) / len(own) for name, own in self.columns.items()}
 
 
 def check_references(sequence: Sequence) -> None:
