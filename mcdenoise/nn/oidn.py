@@ -10,9 +10,10 @@ import itertools
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, UpConvBlock, convolved_in_float32, max_pool
+from mcdenoise.nn._cpu import ConvBlock, UpConvBlock, convolved_in_float32
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import computing_dtype, corner, up_to_multiple
@@ -117,7 +118,7 @@ class OidnUNet(nn.Module):
         for level, block in enumerate(self.encoder):
             x = block(x)
             if level < _LEVELS - 1:
-                x = max_pool(x)
+                x = F.max_pool2d(x, 2)
                 skips.append(x)
         # The coarsest level is the result of the last pooling.
         skips.pop()
@@ -129,7 +130,7 @@ class OidnUNet(nn.Module):
 def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
     layers: list[nn.Module] = []
     for entering, leaving in itertools.pairwise([in_channels, *widths]):
-        layers += [nn.Conv2d(entering, leaving, 3, padding=1), ReLU()]
+        layers += [nn.Conv2d(entering, leaving, 3, padding=1), nn.ReLU(inplace=True)]
         nn.init.kaiming_normal_(layers[-2].weight, nonlinearity="relu")  # type: ignore[arg-type]
         nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
     return ConvBlock(*layers)

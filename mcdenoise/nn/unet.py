@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, ReLU, Upsampling, max_pool
+from mcdenoise.nn._cpu import ConvBlock
 from mcdenoise.ops._window import corner
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
@@ -60,7 +60,7 @@ class UNet(nn.Module):
         entering = [in_channels, *self.widths[:-1]]
         self.encoder = nn.ModuleList(_block(*each) for each in zip(entering, self.widths, strict=True))
         upwards = list(itertools.pairwise(self.widths[::-1]))
-        self.up = nn.ModuleList(Upsampling(coarser, finer, 2, stride=2) for coarser, finer in upwards)
+        self.up = nn.ModuleList(nn.ConvTranspose2d(coarser, finer, 2, stride=2) for coarser, finer in upwards)
         self.decoder = nn.ModuleList(_block(2 * finer, finer) for _, finer in upwards)
 
     def reach(self, scale: int) -> int:
@@ -100,7 +100,7 @@ class UNet(nn.Module):
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
-                x = max_pool(x)
+                x = F.max_pool2d(x, 2)
             x = block(x)
             skips.append(x)
         features = [skips.pop()]
@@ -127,9 +127,9 @@ def _padded(x: Tensor, multiple: int) -> Tensor:
 def _block(in_channels: int, out_channels: int) -> nn.Sequential:
     block = ConvBlock(
         nn.Conv2d(in_channels, out_channels, 3, padding=1),
-        ReLU(),
+        nn.ReLU(inplace=True),
         nn.Conv2d(out_channels, out_channels, 3, padding=1),
-        ReLU(),
+        nn.ReLU(inplace=True),
     )
     for layer in block:
         if isinstance(layer, nn.Conv2d):
