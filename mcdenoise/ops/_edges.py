@@ -16,12 +16,6 @@ from mcdenoise.ops._window import offsets, pad, shifted
 SIGMA_Z, SIGMA_N = 1.0, 128.0
 
 
-def layouts(normal: Tensor | None, depth: Tensor | None) -> dict[str, tuple[Tensor, str]]:
-    """Normal and depth with their layouts, for :func:`mcdenoise.ops._check.check_shapes`."""
-    given = {"normal": (normal, "B 3 H W"), "depth": (depth, "B 1 H W")}
-    return {name: (image, layout) for name, (image, layout) in given.items() if image is not None}
-
-
 def check_sigmas(sigma_z: float, sigma_n: float, sigma_l: float = 1.0) -> None:
     """``ValueError`` for settings out of their range."""
     for name, sigma in (("sigma_z", sigma_z), ("sigma_l", sigma_l)):

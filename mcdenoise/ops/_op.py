@@ -24,37 +24,47 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._backend import Backend, choose_backend
+from mcdenoise.ops._check import check_shapes
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
 def op(
-    *backends: Backend, check: Callable[..., None] | None = None
+    *backends: Backend, check: Callable[..., object] | None = None, **layouts: str
 ) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
     """Make an op of its plain implementation.
 
     Args:
         backends: names of its fast backends.
-        check: takes the arguments of the op, and raises for those that its contract refuses; run before any backend.
+        check: takes some arguments of the op, by name, and raises for those that its contract refuses; run before any
+            backend.
+        layouts: axes of its tensors by name, see :func:`mcdenoise.ops._check.check_shapes`; checked first.
     """
 
     def decorate(plain: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
         parameters = inspect.signature(plain).parameters.values()
-        names = [parameter.name for parameter in parameters]
+        names = [each.name for each in parameters]
+        placed = [each.name for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD]
         defaults = {each.name: each.default for each in parameters if each.default is not inspect.Parameter.empty}
         page = plain.__module__.rpartition(".")[2]
+        checked = [] if check is None else list(inspect.signature(check).parameters)
 
         @functools.wraps(plain)
         def dispatched(*arguments: _Arguments.args, **settings: _Arguments.kwargs) -> _Result:
+            given = {**defaults, **dict(zip(placed, arguments, strict=False)), **settings}
+            twice = settings.keys() & set(placed[: len(arguments)])
+            if twice or len(given) != len(names) or len(arguments) > len(placed):
+                # Python says which argument is missing, unknown or one too many.
+                return plain(*arguments, **settings)
+            check_shapes(**{name: (given[name], layout) for name, layout in layouts.items()})
             if check is not None:
-                check(*arguments, **settings)
+                check(**{name: given[name] for name in checked})
             # The compiler traces no choice; its graph is that of the plain implementation.
             if torch.compiler.is_compiling():
                 return plain(*arguments, **settings)
             tensors = list(_tensors((*arguments, *settings.values())))
             if choose_backend(backends, tensors) == "numba":
-                given = {**defaults, **dict(zip(names, arguments, strict=False)), **settings}
                 result = fast_form(page, plain.__name__)(*[given[name] for name in names])
                 if result is not NotImplemented:
                     return cast(_Result, result)

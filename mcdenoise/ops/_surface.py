@@ -39,9 +39,9 @@ def comparable(surface: Surface | None, previous: Surface | None) -> tuple[Surfa
 
 
 def check_surfaces(
+    previous: Tensor,
     surface: Surface | None,
-    previous: Surface | None,
-    like: Tensor,
+    previous_surface: Surface | None,
     rule: str,
     position_limit: float | None,
     normal_limit: float | None,
@@ -52,13 +52,13 @@ def check_surfaces(
     """
     if rule not in ("relative", "bmfr"):
         raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
-    if surface is None or previous is None:
+    if surface is None or previous_surface is None:
         return
-    here, there = comparable(surface, previous)
+    here, there = comparable(surface, previous_surface)
     for name, channels, a, b in zip(Surface._fields, (3, 3, 1, 1), here, there, strict=True):
         if a is not None and b is not None:
             check_shapes(
-                previous=(like, "B C H W"),
+                previous=(previous, "B C H W"),
                 **{f"surface.{name}": (a, f"B {channels} H W"), f"previous_surface.{name}": (b, f"B {channels} H W")},
             )
     if rule == "bmfr":

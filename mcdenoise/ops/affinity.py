@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_kernel_size, check_least
 from mcdenoise.ops._constants import FARTHEST_FEATURE, LEAST_CENTER
 from mcdenoise.ops._distance import squared_distance
 from mcdenoise.ops._module import module_of
@@ -14,46 +14,43 @@ from mcdenoise.ops._window import accumulator_dtype, offsets, pad, shifted
 
 
 def _check_settings(kernel_size: int, dilation: int) -> None:
-    if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
-    if dilation < 1:
-        raise ValueError(f"dilation: expected at least 1, found {dilation}")
+    check_kernel_size(kernel_size)
+    check_least(1, dilation=dilation)
 
 
 def _check(
-    image: Tensor,
-    features: Tensor,
-    bandwidth: Tensor,
-    center: Tensor,
-    previous: Tensor | None = None,
-    previous_features: Tensor | None = None,
-    previous_bandwidth: Tensor | None = None,
-    previous_weight: Tensor | None = None,
-    *,
-    kernel_size: int = 7,
-    dilation: int = 1,
+    previous: Tensor | None,
+    previous_features: Tensor | None,
+    previous_bandwidth: Tensor | None,
+    previous_weight: Tensor | None,
+    kernel_size: int,
+    dilation: int,
 ) -> None:
     _check_settings(kernel_size, dilation)
-    arguments = {
-        "image": (image, "B C H W"),
-        "features": (features, "B F H W"),
-        "bandwidth": (bandwidth, "B 1 H W"),
-        "center": (center, "B 1 H W"),
+    images = {
+        "previous": previous,
+        "previous_features": previous_features,
+        "previous_bandwidth": previous_bandwidth,
+        "previous_weight": previous_weight,
     }
-    layouts = {
-        "previous": (previous, "B C H W"),
-        "previous_features": (previous_features, "B F H W"),
-        "previous_bandwidth": (previous_bandwidth, "B 1 H W"),
-        "previous_weight": (previous_weight, "B 1 H W"),
-    }
-    given = {name: (each, layout) for name, (each, layout) in layouts.items() if each is not None}
-    check_shapes(**arguments, **given)
-    if given and len(given) < len(layouts):
-        absent = next(name for name in layouts if name not in given)
-        raise ValueError(f"{absent}: expected with {next(iter(given))}, found None")
+    absent = [name for name, image in images.items() if image is None]
+    if 0 < len(absent) < len(images):
+        there = next(name for name in images if name not in absent)
+        raise ValueError(f"{absent[0]}: expected with {there}, found None")
 
 
-@op("numba", check=_check)
+@op(
+    "numba",
+    check=_check,
+    image="B C H W",
+    features="B F H W",
+    bandwidth="B 1 H W",
+    center="B 1 H W",
+    previous="[B C H W]",
+    previous_features="[B F H W]",
+    previous_bandwidth="[B 1 H W]",
+    previous_weight="[B 1 H W]",
+)
 def affinity_filter(
     image: Tensor,
     features: Tensor,

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average, layouts
-from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._op import made_of, op
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._check import check_least, check_shapes
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average
+from mcdenoise.ops._module import module_of
+from mcdenoise.ops._op import made_of
+from mcdenoise.ops._window import accumulator_dtype, pad
 from mcdenoise.ops.moments import luminance
 
 SIGMA_L = 4.0
-# h of Eq. 1 and the Gaussian of Eq. 5, each along one axis.
-_KERNEL, _GAUSSIAN = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16), (1 / 4, 1 / 2, 1 / 4)
+# h of Eq. 1, along one axis.
+_KERNEL = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
 # The smallest deviation: the epsilon of Eq. 5, which the paper leaves open.
 _LEAST_DEVIATION = 1e-10
 
@@ -77,7 +77,8 @@ def atrous(
         >>> bool(filtered.var() < light.var() / 2), bool(variance.max() < 0.05)
         (True, True)
     """
-    sizes = check_shapes(light=(light, "B C H W"), variance=(variance, "B 1 H W"), **layouts(normal, depth))
+    surface = {"normal": (normal, "[B 3 H W]"), "depth": (depth, "[B 1 H W]")}
+    sizes = check_shapes(light=(light, "B C H W"), variance=(variance, "B 1 H W"), **surface)
     if sizes["C"] < 3:
         raise ValueError(f"light: expected at least 3 channels, found {sizes['C']}")
     _check_settings(step, sigma_z, sigma_n, sigma_l)
@@ -94,44 +95,18 @@ def atrous(
     return filtered.to(light.dtype), remaining.to(variance.dtype)
 
 
-class Atrous(nn.Module):
-    """:func:`atrous` with its settings stored.
-
-    Args:
-        step: see :func:`atrous`.
-        sigma_z: see :func:`atrous`.
-        sigma_n: see :func:`atrous`.
-        sigma_l: see :func:`atrous`.
-    """
-
-    def __init__(
-        self, step: int = 1, sigma_z: float = SIGMA_Z, sigma_n: float = SIGMA_N, sigma_l: float = SIGMA_L
-    ) -> None:
-        super().__init__()
-        _check_settings(step, sigma_z, sigma_n, sigma_l)
-        self.step = step
-        self.sigma_z, self.sigma_n, self.sigma_l = sigma_z, sigma_n, sigma_l
-
-    def forward(
-        self, light: Tensor, variance: Tensor, normal: Tensor | None = None, depth: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """See :func:`atrous`."""
-        sigmas = {"sigma_z": self.sigma_z, "sigma_n": self.sigma_n, "sigma_l": self.sigma_l}
-        return atrous(light, variance, normal, depth, step=self.step, **sigmas)
+def _check_settings(step: int, sigma_z: float, sigma_n: float, sigma_l: float) -> None:
+    check_least(1, step=step)
+    check_sigmas(sigma_z, sigma_n, sigma_l)
 
 
-@op("numba")
+Atrous = module_of("Atrous", atrous, _check_settings)
+
+
 def blurred(variance: Tensor) -> Tensor:
     """``g`` of Eq. 5; the border is repeated."""
-    # This imports all of kornia, which takes as long as denoising a frame.
-    from kornia.filters import filter2d_separable
-
-    kernel = numbers_like(variance, _GAUSSIAN)[None]
-    result: Tensor = filter2d_separable(variance, kernel, kernel, border_type="replicate")
-    return result
-
-
-def _check_settings(step: int, sigma_z: float, sigma_n: float, sigma_l: float) -> None:
-    if step < 1:
-        raise ValueError(f"step: expected at least 1, found {step}")
-    check_sigmas(sigma_z, sigma_n, sigma_l)
+    image = pad(variance, 1, "replicate")
+    for dim, size in ((-2, variance.shape[-2]), (-1, variance.shape[-1])):
+        before, here, after = (image.narrow(dim, start, size) for start in range(3))
+        image = here / 2 + (before + after) / 4
+    return image

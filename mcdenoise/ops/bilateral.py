@@ -91,15 +91,10 @@ def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
     return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
 
-def check_normalize(normalize: str) -> None:
-    """``ValueError`` for an unknown normalisation."""
-    if normalize not in ("softmax", "none"):
-        raise ValueError(f"normalize: expected 'softmax' or 'none', found {normalize!r}")
-
-
 def check_settings(normalize: str, border: str) -> None:
     """``ValueError`` for an unknown mode."""
-    check_normalize(normalize)
+    if normalize not in ("softmax", "none"):
+        raise ValueError(f"normalize: expected 'softmax' or 'none', found {normalize!r}")
     check_border(border)
 
 
@@ -117,15 +112,13 @@ def check_weights(
     """The kernel size of arguments that :func:`cross_bilateral_weights` accepts; its errors for others."""
     if len(guides) != len(falloffs):
         raise ValueError(f"falloffs: expected one for each of the {len(guides)} guides, found {len(falloffs)}")
-    arguments = {"kernel": (kernel, "B T H W")}
+    arguments: dict[str, tuple[Tensor | None, str]] = {"kernel": (kernel, "B T H W")}
+    arguments["distance_falloff"] = (distance_falloff, "[B 1 H W]")
     for i, (guide, falloff) in enumerate(zip(guides, falloffs, strict=True)):
         arguments[f"guides[{i}]"] = (guide, f"B C{i} H W")
         arguments[f"falloffs[{i}]"] = (falloff, "B 1 H W")
-    if distance_falloff is not None:
-        arguments["distance_falloff"] = (distance_falloff, "B 1 H W")
     sizes = check_shapes(**arguments)
-    check_normalize(normalize)
-    check_border(border)
+    check_settings(normalize, border)
     return kernel_size_of(sizes["T"], "kernel")
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._window import Border, accumulator_dtype
@@ -14,21 +13,7 @@ from mcdenoise.ops.bilateral import Normalize, check_settings, check_weights, cr
 from mcdenoise.ops.kernel_conv import kernel_conv
 
 
-def _check(
-    image: Tensor,
-    kernel: Tensor,
-    guides: Sequence[Tensor] = (),
-    falloffs: Sequence[Tensor] = (),
-    distance_falloff: Tensor | None = None,
-    *,
-    normalize: str = "softmax",
-    border: str = "replicate",
-) -> None:
-    check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
-    check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
-
-
-@op("numba", check=_check)
+@op("numba", check=check_weights, image="B C H W", kernel="B T H W")
 def cross_bilateral_filter(
     image: Tensor,
     kernel: Tensor,

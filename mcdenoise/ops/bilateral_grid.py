@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_least
 from mcdenoise.ops._constants import GUIDE_STEPS
 from mcdenoise.ops._grid import cells_of, spatial_taps, tent
 from mcdenoise.ops._module import module_of
@@ -15,34 +15,25 @@ from mcdenoise.ops._window import accumulator_dtype
 CELL, BINS = 8, 32
 
 
-def _check_settings(cell: int, bins: int) -> None:
-    for name, value in (("cell", cell), ("bins", bins)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, found {value}")
+def _check_splat(cell: int, bins: int) -> None:
+    check_least(1, cell=cell, bins=bins)
 
 
 def _check_cell(cell: int) -> None:
-    _check_settings(cell, 1)
+    check_least(1, cell=cell)
 
 
-def _check_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> None:
-    check_shapes(image=(image, "B C H W"), guide=(guide, "B 1 H W"))
-    _check_settings(cell, bins)
-
-
-def _check_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> None:
-    sizes = check_shapes(grid=(grid, "B C rows columns bins"), filled=(filled, "B 1 rows columns bins"))
-    sizes |= check_shapes(grid=(grid, "B C rows columns bins"), guide=(guide, "B 1 H W"))
-    _check_settings(cell, sizes["bins"])
-    found, expected = (sizes["rows"], sizes["columns"]), (cells_of(sizes["H"], cell), cells_of(sizes["W"], cell))
+def _check_slice(grid: Tensor, guide: Tensor, cell: int) -> None:
+    found, size = tuple(grid.shape[2:4]), tuple(guide.shape[2:])
+    check_least(1, cell=cell, bins=grid.shape[4])
+    expected = tuple(cells_of(side, cell) for side in size)
     if found != expected:
         raise ValueError(
-            f"grid: expected {expected} rows and columns for a guide of {sizes['H'], sizes['W']} in cells of {cell}, "
-            f"found {found}"
+            f"grid: expected {expected} rows and columns for a guide of {size} in cells of {cell}, found {found}"
         )
 
 
-@op("numba", check=_check_splat)
+@op("numba", check=_check_splat, image="B C H W", guide="B 1 H W")
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
     """Average an image in the cells of a bilateral grid: blocks of pixels, separated by the value of a guide.
 
@@ -98,7 +89,13 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
     return grid.to(image.dtype), filled.to(image.dtype)
 
 
-@op("numba", check=_check_slice)
+@op(
+    "numba",
+    check=_check_slice,
+    grid="B C rows columns bins",
+    filled="B 1 rows columns bins",
+    guide="B 1 H W",
+)
 def grid_slice(grid: Tensor, filled: Tensor, guide: Tensor, *, cell: int = CELL) -> Tensor:
     """Read an image out of a bilateral grid: at each pixel the mean of the eight cells around its place and its guide.
 
@@ -164,5 +161,5 @@ def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple
     return index.flatten(1), weight.flatten(1, 3)
 
 
-GridSplat = module_of("GridSplat", grid_splat, _check_settings)
+GridSplat = module_of("GridSplat", grid_splat, _check_splat)
 GridSlice = module_of("GridSlice", grid_slice, _check_cell)

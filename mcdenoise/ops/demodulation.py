@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_positive, check_shapes
 from mcdenoise.ops._constants import FLOOR, NO_ALBEDO
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
@@ -83,8 +83,7 @@ Remodulate = module_of("Remodulate", remodulate)
 
 def modulation(albedo: Tensor, floor: float = FLOOR) -> Tensor:
     """The modulation ``m`` by which :func:`demodulate` divides, ``(B, C, H, W)``."""
-    if not floor > 0:
-        raise ValueError(f"floor: expected a positive number, found {floor}")
+    check_positive(floor=floor)
     albedo = albedo.to(accumulator_dtype(albedo.dtype))
     textured = (albedo >= NO_ALBEDO).any(1, keepdim=True)
     return torch.where(textured, albedo.clamp_min(floor), 1)

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_kernel_size, check_positive, check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
 
@@ -54,15 +54,9 @@ def clamp_fireflies(image: Tensor, *, limit: float | Tensor = LIMIT, kernel_size
         >>> clamp_fireflies(image)[0, :, 2, 2].tolist()
         [15.0, 15.0, 15.0]
     """
-    check_shapes(image=(image, "B C H W"))
-    if isinstance(limit, Tensor):
-        check_shapes(image=(image, "B C H W"), limit=(limit, "B 1 1 1"))
-        _check_settings(LIMIT, kernel_size)
-    else:
-        _check_settings(limit, kernel_size)
-        if limit == math.inf:
-            return image
-    if image.numel() == 0:
+    check_shapes(image=(image, "B C H W"), limit=(limit if isinstance(limit, Tensor) else None, "[B 1 1 1]"))
+    _check_settings(limit, kernel_size)
+    if image.numel() == 0 or (not isinstance(limit, Tensor) and limit == math.inf):
         return image
     source = image.to(accumulator_dtype(image.dtype))
     # Only ratios of brightness matter, so it is scaled down by a power of two, which rounds nothing, and no sum
@@ -87,11 +81,10 @@ def clamp_fireflies(image: Tensor, *, limit: float | Tensor = LIMIT, kernel_size
     return torch.where(bright, clamped, source).to(image.dtype)
 
 
-def _check_settings(limit: float, kernel_size: int) -> None:
-    if not limit > 0:
-        raise ValueError(f"limit: expected above 0, found {limit}")
-    if kernel_size < 3 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+def _check_settings(limit: float | Tensor, kernel_size: int) -> None:
+    if not isinstance(limit, Tensor):
+        check_positive(limit=limit)
+    check_kernel_size(kernel_size, 3)
 
 
 ClampFireflies = module_of("ClampFireflies", clamp_fireflies, _check_settings)

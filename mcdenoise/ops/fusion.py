@@ -7,15 +7,9 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
-from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype, corner
 
 
-def _check_image(image: Tensor) -> None:
-    check_shapes(image=(image, "B C H W"))
-
-
-@op("numba", check=_check_image)
 def downsample(image: Tensor) -> Tensor:
     """Average blocks of 2x2 pixels.
 
@@ -41,6 +35,7 @@ def downsample(image: Tensor) -> Tensor:
         >>> downsample(torch.arange(9.0).reshape(1, 1, 3, 3)).flatten().tolist()
         [2.0, 3.5, 6.5, 8.0]
     """
+    check_shapes(image=(image, "B C H W"))
     if 0 in image.shape:
         return image[..., ::2, ::2]
     return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)

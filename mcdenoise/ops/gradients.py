@@ -6,8 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, bounded_quotient, check_sigmas, edge_average, layouts
+from mcdenoise.ops._check import check_least, check_shapes
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, bounded_quotient, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
@@ -84,9 +84,14 @@ def temporal_gradient(
         >>> temporal_gradient(lit, lit).unique().tolist(), temporal_gradient(0 * lit, lit).unique().tolist()
         ([0.0], [1.0])
     """
-    given = {"weight": weight, "variance": variance}
-    images = {name: (image, "B 1 H W") for name, image in given.items() if image is not None}
-    check_shapes(current=(current, "B 1 H W"), previous=(previous, "B 1 H W"), **images, **layouts(normal, depth))
+    check_shapes(
+        current=(current, "B 1 H W"),
+        previous=(previous, "B 1 H W"),
+        weight=(weight, "[B 1 H W]"),
+        variance=(variance, "[B 1 H W]"),
+        normal=(normal, "[B 3 H W]"),
+        depth=(depth, "[B 1 H W]"),
+    )
     _check_settings(stratum, levels, threshold, sigma_z, sigma_n)
     difference, size, noise = sums_of_strata(
         *(current, previous, weight, variance, normal, depth),
@@ -106,9 +111,8 @@ def temporal_gradient(
 
 
 def _check_settings(stratum: int, levels: int, threshold: float, sigma_z: float, sigma_n: float) -> None:
-    for name, value, least in (("stratum", stratum, 1), ("levels", levels, 0), ("threshold", threshold, 0)):
-        if not value >= least:
-            raise ValueError(f"{name}: expected at least {least}, found {value}")
+    check_least(1, stratum=stratum)
+    check_least(0, levels=levels, threshold=threshold)
     check_sigmas(sigma_z, sigma_n)
 
 

@@ -8,23 +8,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_kernel_size
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op
 from mcdenoise.ops._window import accumulator_dtype
 
 
 def _check_size(kernel_size: int) -> None:
-    if kernel_size < 3 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+    check_kernel_size(kernel_size, 3)
 
 
-def _check(image: Tensor, importance: Tensor, *, kernel_size: int) -> None:
-    check_shapes(image=(image, "B C H W"), importance=(importance, "B 1 H W"))
-    _check_size(kernel_size)
-
-
-@op("numba", check=_check)
+@op("numba", check=_check_size, image="B C H W", importance="B 1 H W")
 def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) -> Tensor:
     """Average over a window with weights that one map of importance gives to all pixels: softmax of the map over it.
 

@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op
 from mcdenoise.ops._window import (
@@ -22,13 +21,12 @@ from mcdenoise.ops._window import (
 )
 
 
-def _check(image: Tensor, kernel: Tensor, *, border: str = "replicate") -> None:
-    sizes = check_shapes(image=(image, "B C H W"), kernel=(kernel, "B T H W"))
+def _check(kernel: Tensor, border: str) -> None:
     check_border(border)
-    kernel_size_of(sizes["T"], "kernel")
+    kernel_size_of(kernel.shape[1], "kernel")
 
 
-@op("numba", check=_check)
+@op("numba", check=_check, image="B C H W", kernel="B T H W")
 def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Filter an image with a kernel of its own at every pixel; all channels share the pixel's kernel.
 
@@ -77,7 +75,7 @@ def kernel_conv(image: Tensor, kernel: Tensor, *, border: Border = "replicate") 
     return total.to(image.dtype)
 
 
-@op(check=_check)
+@op(check=_check, image="B C H W", kernel="B T H W")
 def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate") -> Tensor:
     """Spread every pixel over its neighbours with a kernel of its own: the transpose of :func:`kernel_conv`.
 

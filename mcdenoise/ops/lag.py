@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_kernel_size, check_positive, check_shapes
 from mcdenoise.ops._constants import LAG_WINDOW, SMALLEST_LAG
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
@@ -90,10 +90,8 @@ def history_lag(
 
 
 def _check_settings(threshold: float, kernel_size: int) -> None:
-    if not threshold > 0:
-        raise ValueError(f"threshold: expected above 0, found {threshold}")
-    if kernel_size < 3 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 3, found {kernel_size}")
+    check_positive(threshold=threshold)
+    check_kernel_size(kernel_size, 3)
 
 
 HistoryLag = module_of("HistoryLag", history_lag, _check_settings)

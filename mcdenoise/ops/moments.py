@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average, layouts
+from mcdenoise.ops._check import check_kernel_size, check_shapes
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype
@@ -90,7 +90,7 @@ def moments_variance(
         >>> bool(abs(moments_variance(samples, kernel_size=31)[0, 0, 16, 16] - 1) < 0.25)
         True
     """
-    check_shapes(moments=(moments, "B 2 H W"), **layouts(normal, depth))
+    check_shapes(moments=(moments, "B 2 H W"), normal=(normal, "[B 3 H W]"), depth=(depth, "[B 1 H W]"))
     _check_settings(kernel_size, sigma_z, sigma_n)
     mean, scale = moments.to(accumulator_dtype(moments.dtype)), 1.0
     if kernel_size > 1:
@@ -116,8 +116,7 @@ def luminance(light: Tensor) -> Tensor:
 
 
 def _check_settings(kernel_size: int, sigma_z: float, sigma_n: float) -> None:
-    if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ValueError(f"kernel_size: expected odd and at least 1, found {kernel_size}")
+    check_kernel_size(kernel_size)
     check_sigmas(sigma_z, sigma_n)
 
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_least, check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import mirrored_places
 
@@ -111,12 +111,10 @@ def block_regression(
 
 
 def _check_settings(block: int, offset: tuple[int, int], squares: int, ridge: float) -> None:
-    if block < 2:
-        raise ValueError(f"block: expected at least 2, found {block}")
+    check_least(2, block=block)
     if len(offset) != 2 or not all(0 <= start < block for start in offset):
         raise ValueError(f"offset: expected two numbers from 0 to {block - 1}, found {offset}")
-    if squares < 0:
-        raise ValueError(f"squares: expected at least 0, found {squares}")
+    check_least(0, squares=squares)
     if not 0 < ridge < math.inf:
         raise ValueError(f"ridge: expected a positive number, found {ridge}")
 

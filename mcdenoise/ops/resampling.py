@@ -7,7 +7,6 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._constants import CUBIC
 from mcdenoise.ops._op import op
 from mcdenoise.ops.temporal import places_before
@@ -15,11 +14,7 @@ from mcdenoise.ops.temporal import places_before
 __all__ = ["resample"]
 
 
-def _check(previous: Tensor, motion: Tensor) -> None:
-    check_shapes(previous=(previous, "B C H W"), motion=(motion, "B 2 H W"))
-
-
-@op("numba", check=_check)
+@op("numba", previous="B C H W", motion="B 2 H W")
 def resample(previous: Tensor, motion: Tensor) -> Tensor:
     """Fetch the previous frame at the previous place of each pixel by limited bicubic interpolation.
 

@@ -70,21 +70,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
     return torch.where(in_front, previous - centre, torch.inf)
 
 
-def _check_reproject(
-    previous: Tensor,
-    motion: Tensor | None,
-    surface: Surface | None = None,
-    previous_surface: Surface | None = None,
-    *,
-    rule: str = "relative",
-    position_limit: float | None = None,
-    normal_limit: float | None = None,
-) -> None:
-    _check_images(motion, previous=(previous, "B C H W"))
-    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
-
-
-@op("numba", check=_check_reproject)
+@op("numba", check=check_surfaces, previous="B C H W", motion="[B 2 H W]")
 def reproject(
     previous: Tensor,
     motion: Tensor | None,
@@ -210,15 +196,15 @@ def check_accumulate(
     normal_limit: float | None = None,
 ) -> None:
     """``TypeError`` or ``ValueError`` for arguments that :func:`accumulate` refuses."""
-    _check_images(
-        motion,
+    check_shapes(
         color=(color, "B C H W"),
         previous=(previous, "B C H W"),
         previous_length=(previous_length, "B 1 H W"),
+        motion=(motion, "[B 2 H W]"),
     )
     if not 0 < alpha_min <= 1:
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
-    check_surfaces(surface, previous_surface, previous, rule, position_limit, normal_limit)
+    check_surfaces(previous, surface, previous_surface, rule, position_limit, normal_limit)
 
 
 @op("numba", check=check_accumulate)
@@ -298,10 +284,6 @@ def accumulate(
 
 
 Accumulate = module_of("Accumulate", accumulate)
-
-
-def _check_images(motion: Tensor | None, **images: tuple[Tensor, str]) -> None:
-    check_shapes(**images, **({} if motion is None else {"motion": (motion, "B 2 H W")}))
 
 
 def places_before(motion: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:

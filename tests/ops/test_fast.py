@@ -89,7 +89,6 @@ WINDOWS: dict[str, tuple[Callable[[Draw], Inputs], dict[str, Any]]] = {
     "moments_variance": (_moments, {"kernel_size": 5, "sigma_n": 2.0}),
     "temporal_gradient": (_changes, {"stratum": 2, "levels": 2, "sigma_n": 2.0}),
     "resample": (lambda draw: {"previous": draw(3), "motion": 4 * draw(2) - 2}, {}),
-    "downsample": (lambda draw: {"image": draw(3)}, {}),
 }
 every_window = pytest.mark.parametrize("op", [op for op in FAST if op.name in WINDOWS], ids=lambda op: op.name)
 

@@ -8,7 +8,6 @@ import torch
 from reference_cases import by, channels_last, every_other_column, slice_of_pixels, transposed
 from torch import Tensor
 
-from mcdenoise.ops import downsample
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import transfer, wild
 
@@ -46,7 +45,6 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
     radiance = [layout(draw(seed, batch, 3, height, width, dtype).exp()) for seed in (3, 19, 20)]
     predicted, on_scale = (layout(draw(21, batch, count, height, width, dtype).tanh()) for count in (7, 9))
     calls: list[Call] = [
-        (downsample, [some(13, 3)]),
         # From the dark, where the scale is linear, to the largest radiance and beyond.
         (transfer.compress, [layout((6 * draw(15, batch, 3, height, width, dtype)).exp())]),
         (transfer.expand, [layout(draw(16, batch, 3, height, width, dtype).sigmoid())]),
