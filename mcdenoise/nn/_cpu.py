@@ -36,8 +36,7 @@ class UpConvBlock(ConvBlock):
         """Convolve ``(B, C, H, W)`` and ``(B, S, 2 H, 2 W)``."""
         dtype, (first, *others) = computing_dtype(x), self
         exporting = torch.compiler.is_exporting()
-        here = exporting or (is_cpu_inference(x) and _has_fused_convolution(dtype))
-        if not (here and isinstance(first, nn.Conv2d)):
+        if not ((exporting or _is_fused(x, dtype)) and isinstance(first, nn.Conv2d)):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
         coarse, fine = first.weight.split([x.shape[1], skip.shape[1]], 1)
         x = F.conv_transpose2d(x.to(dtype), _kernels_of_pixels(coarse).to(dtype), stride=2, padding=1)
@@ -62,22 +61,15 @@ def _kernels_of_pixels(weight: Tensor) -> Tensor:
 
 
 def _run(layers: Iterable[nn.Module], x: Tensor) -> Tensor:
-    """Alternating convolutions and ReLUs."""
-    fused = is_cpu_inference(x)
+    """Alternating convolutions and ReLUs, fused by oneDNN if possible; torch offers this only to its compiler."""
+    dtype = computing_dtype(x)
+    fused = _is_fused(x, dtype)
     for layer in layers:
         if not fused:
             x = layer(x)
         elif isinstance(layer, nn.Conv2d):
-            x = _convolved_with_relu(x, layer)
+            x = _convolved(x, layer.weight, layer.bias, dtype, "relu")
     return x
-
-
-def _convolved_with_relu(x: Tensor, layer: nn.Conv2d) -> Tensor:
-    """A convolution with ReLU, fused by oneDNN if possible; torch offers this only to its compiler."""
-    dtype = computing_dtype(x)
-    if not _has_fused_convolution(dtype):
-        return F.relu_(layer(x))
-    return _convolved(x, layer.weight, layer.bias, dtype, "relu")
 
 
 def _convolved(
@@ -107,7 +99,7 @@ def convolved_in_float32(x: Tensor, layer: nn.Conv2d) -> Tensor:
     Weights and bias are rounded to bfloat16, as those of all other layers.
     """
     dtype = x.dtype
-    if dtype != torch.bfloat16 or not (is_cpu_inference(x) and _has_fused_convolution(dtype)):
+    if dtype != torch.bfloat16 or not _is_fused(x, dtype):
         with _without_autocast(x.device.type):
             return cast(Tensor, layer(x.to(layer.weight.dtype)))
     rough = _convolved(x, layer.weight, layer.bias, dtype)
@@ -132,5 +124,7 @@ def _has_fused_convolution(dtype: torch.dtype) -> bool:
         return False
 
 
-def is_cpu_inference(x: Tensor) -> bool:
-    return x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+def _is_fused(x: Tensor, dtype: torch.dtype) -> bool:
+    """Whether oneDNN convolves, and applies a function to the result in the same step."""
+    inference = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    return inference and _has_fused_convolution(dtype)
