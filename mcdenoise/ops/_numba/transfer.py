@@ -17,40 +17,34 @@ _Y0, _Y1, _X0, _X1 = PU_JOINTS
 
 def compress(radiance: Tensor) -> Any:
     """See :func:`mcdenoise.ops._steps.transfer.compress`."""
-    return _mapped(radiance, _compress_rows)
+    return _mapped(radiance, expanding=False)
 
 
 def expand(compressed: Tensor) -> Any:
     """See :func:`mcdenoise.ops._steps.transfer.expand`."""
-    return _mapped(compressed, _expand_rows)
+    return _mapped(compressed, expanding=True)
 
 
-def _mapped(image: Tensor, rows: Any) -> Any:
+def _mapped(image: Tensor, *, expanding: bool) -> Any:
     if image.ndim != 4 or image.dtype not in (torch.float32, torch.float64):
         return NotImplemented
     result = torch.empty(image.shape, dtype=image.dtype, device="cpu")
     if result.numel():
-        arguments = (result.numpy(), source(image))
-        share_rows(image, lambda *span: rows(*arguments, *span), light=True)
+        arguments = (result.numpy(), source(image), expanding)
+        share_rows(image, lambda *rows: _map_rows(*arguments, *rows), light=True)
     return result
 
 
 @compiled
-def _compress_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
+def _map_rows(out: Any, image: Any, expanding: bool, b: int, first: int, last: int) -> None:
     for y in range(first, last):
         for c in range(out.shape[1]):
             row = out[b, c, y]
             read_row(row, image, b, c, y, 0)
-            compress_values(row)
-
-
-@compiled
-def _expand_rows(out: Any, image: Any, b: int, first: int, last: int) -> None:
-    for y in range(first, last):
-        for c in range(out.shape[1]):
-            row = out[b, c, y]
-            read_row(row, image, b, c, y, 0)
-            expand_values(row)
+            if expanding:
+                expand_values(row)
+            else:
+                compress_values(row)
 
 
 @compiled
