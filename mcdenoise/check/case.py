@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Generator, Tensor, nn
+from torch.utils import _pytree as pytree
 
 from mcdenoise import ops
 from mcdenoise.ops import Surface
@@ -80,10 +81,9 @@ class Op:
             inputs need it.
         finite: whether results are finite where all inputs are.
         half_precision: whether the op supports inputs in half precision.
-        batched: whether the first axis of all tensors is the batch, and the op treats its images identically and
-            independently, so that many inputs can be checked at once.
         own: whether it is a user's function, see :mod:`mcdenoise.check.own`. Its derivatives in float64 are checked
-            first; it may combine the images of a batch; and in half precision its intermediate values are rounded.
+            first; it may combine the images of a batch, while ops treat them identically and independently, so that
+            many inputs can be checked at once; and in half precision its intermediate values are rounded.
     """
 
     function: Callable[..., Any]
@@ -94,7 +94,6 @@ class Op:
     rounds: Callable[[Any, dict[str, Any]], Mapping[str, Any]] = lambda inputs, settings: {}
     finite: bool = True
     half_precision: bool = True
-    batched: bool = True
     own: bool = False
 
     @property
@@ -111,27 +110,13 @@ class Op:
 
 def map_tensors(function: Callable[[Tensor], Tensor], inputs: Inputs) -> Inputs:
     """Apply ``function`` to each tensor in ``inputs``."""
-
-    def apply(value: Value) -> Value:
-        if isinstance(value, Surface):
-            return Surface(*(None if part is None else function(part) for part in value))
-        if isinstance(value, list):
-            return [function(part) for part in value]
-        return None if value is None else function(value)
-
-    return {name: apply(value) for name, value in inputs.items()}
+    mapped: Inputs = pytree.tree_map_only(Tensor, function, inputs)
+    return mapped
 
 
 def tensors_in(inputs: Inputs) -> list[Tensor]:
     """The tensors of a case's inputs, in order."""
-    found: list[Tensor] = []
-
-    def note(tensor: Tensor) -> Tensor:
-        found.append(tensor)
-        return tensor
-
-    map_tensors(note, inputs)
-    return found
+    return [each for each in pytree.tree_leaves(inputs) if isinstance(each, Tensor)]
 
 
 def as_tuple(results: Any) -> tuple[Tensor, ...]:

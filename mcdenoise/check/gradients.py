@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.gradcheck import GradcheckError
 
 from mcdenoise.check.case import as_tuple, tensors_in
-from mcdenoise.check.cases import OPS, STEPS, Case, Inputs, Op, map_tensors
+from mcdenoise.check.cases import Case, Inputs, Op, map_tensors
 from mcdenoise.check.own import find_ops, op_of
 from mcdenoise.ops import use
 
@@ -73,30 +73,21 @@ def gradcheck(function: Callable[..., Any], *inputs: Tensor, order: int = 2) -> 
     return [check_case(op, case, order) for case in op.cases if case.differentiable]
 
 
-def check(names: Sequence[str] | None = None) -> list[GradcheckResult]:
-    """Compare first and second derivatives with finite differences, in float64.
+def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
+    """The cases that have a differentiable input, each with its op.
 
     Args:
         names: ops to check, or functions of your own, ``path/to/file.py:function`` or ``package.module:function``;
             ``None`` means all ops.
 
-    Returns:
-        One result for each case that has a differentiable input.
-
     Raises:
         InputError: there is no such op or function, or the function runs on none of its example inputs.
     """
-    return [check_case(op, case) for op, case in select(names)]
-
-
-def select(names: Sequence[str] | None = None) -> list[tuple[Op, Case]]:
-    """The cases that :func:`check` checks, each with its op; raises ``InputError`` like it."""
-    ops = OPS + STEPS if names is None else find_ops(names, OPS + STEPS)
-    return [(op, case) for op in ops for case in op.cases if case.differentiable]
+    return [(op, case) for op in find_ops(names) for case in op.cases if case.differentiable]
 
 
 def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
-    """:func:`check` for one case; with ``order`` 1 only of first derivatives."""
+    """Compare first and second derivatives with finite differences, in float64; with ``order`` 1 only first ones."""
     start = time.perf_counter()
     try:
         with torch.random.fork_rng(devices=[]):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,43 +15,28 @@ from mcdenoise.ops import use
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
-@dataclass(frozen=True)
-class OpOverview:
-    """Summary of one op.
+def overview() -> list[dict[str, Any]]:
+    """Summarize every op; this measures its errors against float64.
 
-    Args:
-        name: name of the op.
-        summary: first line of its docstring.
-        differentiable: the arguments in which it is differentiable.
-        cases: number of its test cases.
-        errors: maximum relative error over the ordinary cases, by dtype (``"float32"``); see :func:`relative_error`.
-        module: name of the Module twin, if there is one.
+    Returns:
+        For each op its ``name``; ``summary``, the first line of its docstring; ``differentiable``, the arguments in
+        which it is; ``cases``, their number; ``errors`` by dtype (``"float32"``), the maximum relative error over the
+        ordinary cases, see :func:`relative_error`; and ``module``, the name of the Module twin, if there is one.
     """
-
-    name: str
-    summary: str
-    differentiable: tuple[str, ...]
-    cases: int
-    errors: dict[str, float]
-    module: str | None
-
-
-def overview() -> list[OpOverview]:
-    """Summarize every op; this measures its errors against float64."""
     return [
-        OpOverview(
-            name=op.name,
-            summary=(op.function.__doc__ or "").strip().partition("\n")[0],
-            differentiable=tuple(dict.fromkeys(name for case in op.cases for name in case.differentiable)),
-            cases=len(op.cases),
-            errors={
+        {
+            "name": op.name,
+            "summary": (op.function.__doc__ or "").strip().partition("\n")[0],
+            "differentiable": list(dict.fromkeys(name for case in op.cases for name in case.differentiable)),
+            "cases": len(op.cases),
+            "errors": {
                 str(dtype).removeprefix("torch."): max(
                     relative_error(op, case, dtype) for case in op.cases if case.kind == "ordinary"
                 )
                 for dtype in DTYPES
             },
-            module=None if op.module is None else op.module.__name__,
-        )
+            "module": None if op.module is None else op.module.__name__,
+        }
         for op in OPS
     ]
 

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check.case import Case, Op, between, constant, map_tensors, tensors_in, times
+from mcdenoise.check.cases import OPS, STEPS
 from mcdenoise.check.regimes import Argument, checked, extreme, stiff
 from mcdenoise.errors import InputError, did_you_mean, in_one_line
 from mcdenoise.methods import parse_method
@@ -40,17 +41,19 @@ IMAGE = (1, 3, 5, 6)
 _PLAIN = between(0.1, 1.1)
 
 
-def find_ops(names: Sequence[str], table: Sequence[Op]) -> list[Op]:
+def find_ops(names: Sequence[str] | None, table: Sequence[Op] = OPS + STEPS) -> list[Op]:
     """Find ops by name.
 
     Args:
         names: names of ops in the table, or ``path/to/file.py:function``, ``package.module:function``, which may have
-            settings as in :func:`mcdenoise.methods.parse_method`.
+            settings as in :func:`mcdenoise.methods.parse_method`; ``None`` means the whole table.
         table: the known ops.
 
     Raises:
         InputError: there is no such op or function, or the function runs on none of its example inputs.
     """
+    if names is None:
+        return list(table)
     known = {op.name: op for op in table}
     unknown = [name for name in names if name not in known and ":" not in name and not name.endswith(".py")]
     if unknown:
@@ -132,7 +135,7 @@ def _op(name: str, function: Any, examples: Any) -> Op:
         _check_tensors(where, tensors)
         _check_results(where, function, tensors)
     cases = tuple(_case(str(case), function, tensors) for case, tensors in given.items())
-    return Op(_by_name(name, function), cases, batched=False, own=True)
+    return Op(_by_name(name, function), cases, own=True)
 
 
 def _on_images(name: str, function: Any) -> Op:
@@ -149,7 +152,7 @@ def _on_images(name: str, function: Any) -> Op:
         regimes += [stiff(f"firefly in {x}", IMAGE, _PLAIN, (), change=partial(_add_firefly, [x])) for x in names]
     # For the other images the step of the finite differences is too large or too small.
     only: dict[str, Any] = {"sizes": {"ordinary image": IMAGE}, "image": _PLAIN, "limits": {}, "fireflies": None}
-    op = checked(_by_name(name, function), dict.fromkeys(names, Argument()), *regimes, batched=False, own=True, **only)
+    op = checked(_by_name(name, function), dict.fromkeys(names, Argument()), *regimes, own=True, **only)
     try:
         if not names:
             raise InputError("it names no argument without a default")

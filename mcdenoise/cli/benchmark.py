@@ -149,7 +149,7 @@ def _time_ops(
             device=device,
             out=out,
             command=command,
-            ops=find_ops([str(name) for name in names], OPS) if names else OPS,
+            ops=find_ops([str(name) for name in names] or None, OPS),
             on_step=on_step,
         )
     print_rows(op_rows(costs))

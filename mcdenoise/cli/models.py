@@ -74,13 +74,13 @@ def _list_ops(json: Json) -> None:
     print_rows(
         [
             {
-                "op": entry.name,
-                "description": entry.summary,
-                "differentiable in": ", ".join(entry.differentiable),
-                "cases": str(entry.cases),
-                **{name: f"{entry.errors[name]:.0e}" for name in ("float32", "bfloat16", "float16")},
+                "op": entry["name"],
+                "description": entry["summary"],
+                "differentiable in": ", ".join(entry["differentiable"]),
+                "cases": str(entry["cases"]),
+                **{dtype: f"{error:.0e}" for dtype, error in entry["errors"].items()},
             }
             for entry in entries
         ]
     )
-    write_json(json, [asdict(entry) for entry in entries])
+    write_json(json, entries)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from operator import attrgetter
+from typing import Literal
 
+import torch
 import tyro
 
-from mcdenoise.check.stability import FRAMES, LONG_RUNS, VALID_SHOT, Check, as_json, groups, parse_dtypes
+from mcdenoise.check.stability import FRAMES, LONG_RUNS, VALID_SHOT, Check, groups
 from mcdenoise.cli._options import Json
 from mcdenoise.cli._output import print_rows, progress_bar, write_json
 from mcdenoise.errors import InputError
@@ -15,7 +18,7 @@ from mcdenoise.errors import InputError
 def stability(
     ops: tyro.conf.Positional[list[str]] = [],  # noqa: B006 - tyro reads it
     models: list[str] = [],  # noqa: B006
-    dtypes: list[str] = ["float32", "bfloat16", "float16"],  # noqa: B006
+    dtypes: list[Literal["float32", "bfloat16", "float16"]] = ["float32", "bfloat16", "float16"],  # noqa: B006
     frames: int = FRAMES,
     json: Json = None,
 ) -> int:
@@ -36,9 +39,11 @@ def stability(
         frames: number of frames of the long runs.
         json: write every check to this file too.
     """
+    if not dtypes:
+        raise InputError("--dtypes: expected some of float32, bfloat16, float16, found none")
     if frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
-    chosen = groups(ops or None, models or None, parse_dtypes(dtypes), frames)
+    chosen = groups(ops or None, models or None, [getattr(torch, name) for name in dtypes], frames)
     checks: list[Check] = []
     with progress_bar() as progress:
         for group in progress.track(chosen, description="stability"):
@@ -59,8 +64,8 @@ def stability(
     )
     for note in filter(None, (group.note for group in chosen)):
         print(note)
-    write_json(json, as_json(checks))
     failed = sum(not check.passed for check in checks)
+    write_json(json, {"passed": not failed, "checks": [asdict(check) for check in checks]})
     print(f"{len(checks)} checks, {failed} failed")
     return 1 if failed else 0
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mcdenoise.check import gradients
 from mcdenoise.check.cases import STEPS, Case, Op
-from mcdenoise.check.stability._ops import check_op, select
+from mcdenoise.check.stability._ops import check_op
 from mcdenoise.ops._op import backends_of
 from mcdenoise.ops._steps import history
 
@@ -41,11 +41,11 @@ def test_is_its_formula(step: Op, case: Case, backend: str) -> None:
 
 @every_step
 def test_gradcheck(step: Op) -> None:
-    results = gradients.check([step.name])
+    results = [gradients.check_case(*each) for each in gradients.select([step.name])]
     assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
 
 
-@pytest.mark.parametrize("step", [step for step in select() if step in STEPS], ids=lambda step: step.name)
+@every_step
 def test_stability(step: Op) -> None:
     checks = list(check_op(step))
     assert checks

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 
-from mcdenoise.check.own import note_of
+from mcdenoise.check.own import find_ops, note_of
 from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
-from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check, parse_dtypes
+from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check
 from mcdenoise.check.stability._denoiser import VALID_SHOT, check_denoiser
 from mcdenoise.check.stability._long_runs import FRAMES, long_runs
 from mcdenoise.check.stability._models import check_model
@@ -28,7 +26,6 @@ __all__ = [
     "VALID_SHOT",
     "Check",
     "Group",
-    "as_json",
     "check_case",
     "check_denoiser",
     "check_model",
@@ -36,7 +33,6 @@ __all__ = [
     "check_stability",
     "groups",
     "long_runs",
-    "parse_dtypes",
 ]
 
 
@@ -76,7 +72,7 @@ def groups(
         InputError: there is no such op, or a named model is not available.
     """
     everything = ops is None and models is None
-    chosen_ops = _ops.select(ops) if everything or ops is not None else []
+    chosen_ops = find_ops(ops) if everything or ops is not None else []
     chosen_models = _available(models) if everything or models is not None else []
     return [
         *(Group(op.name, partial(_ops.check_op, op, dtypes), note_of(op)) for op in chosen_ops),
@@ -98,13 +94,3 @@ def _available(names: Sequence[str] | None) -> list[str]:
             continue
         found.append(name)
     return found
-
-
-def as_json(checks: Sequence[Check]) -> dict[str, Any]:
-    """All results as JSON values; infinite values and NaN become ``null``."""
-    rows = [{name: _number(value) for name, value in asdict(check).items()} for check in checks]
-    return {"passed": all(check.passed for check in checks), "checks": rows}
-
-
-def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

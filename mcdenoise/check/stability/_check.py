@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-
-from mcdenoise.errors import InputError
 
 DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 LONG_RUNS = "long runs"
@@ -64,22 +61,5 @@ def bounded(
     """A check that there is no message, and that an error is at most what is allowed; NaN is not."""
     if not message and not error <= allowed:
         message = f"error {error:.3g}, expected at most {allowed:.3g}"
-    return Check(subject, case, name_of(dtype), backend, what, error, allowed, condition, not message, message)
-
-
-def parse_dtypes(names: Sequence[str]) -> tuple[torch.dtype, ...]:
-    """Dtypes by name.
-
-    Raises:
-        InputError: a name is not one of float32, bfloat16, float16.
-    """
-    known = {name_of(dtype): dtype for dtype in DTYPES}
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise InputError(f"dtypes: expected some of {', '.join(known)}, found {', '.join(unknown) or 'none'}")
-    return tuple(known[name] for name in names)
-
-
-def name_of(dtype: torch.dtype) -> str:
-    """Name of a dtype, such as ``"float32"`` for ``torch.float32``."""
-    return str(dtype).removeprefix("torch.")
+    name = str(dtype).removeprefix("torch.")
+    return Check(subject, case, name, backend, what, error, allowed, condition, not message, message)

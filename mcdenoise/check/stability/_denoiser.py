@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -50,29 +49,26 @@ def check_denoiser(model: str = DEFAULT, dtypes: Sequence[torch.dtype] = DTYPES)
     Raises:
         InputError: there is no such model, or it has no weights.
     """
-    name = f"Denoiser, {model}"
+    found = partial(bounded, f"Denoiser, {model}")
     for dtype in dtypes:
-        known = dtype == torch.float16 and torch.float32 in dtypes
-        for check in _checks(model, dtype, first=dtype == dtypes[0], known=known):
-            yield replace(check, subject=name)
-
-
-def _checks(model: str, dtype: torch.dtype, *, first: bool, known: bool) -> Iterator[Check]:
-    precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
-    denoiser = parse_method(model).denoiser(precision=precision)
-    # Skip shots that lack a buffer which the model needs.
-    buffers = denoiser.model.needs.buffers
-    every = {name: shot for name, shot in shots(dtype).items() if all(buffers <= each.buffers for each in shot)}
-    # Decisions about the whole image, such as to skip it, are the same in every dtype: one sees each shot alone.
-    for batch in [{name: shot} for name, shot in every.items()] if first else _batches(every):
-        yield from _valid(denoiser, batch, dtype)
-    if not buffers <= frame(0, dtype).buffers:
-        return
-    if dtype == torch.float32:
-        yield from _gradients(model, {name: every[name] for name in _DIFFERENTIATED})
-    # A denoiser computes in float32 with frames of either dtype.
-    if not known:
-        yield from _exposed(denoiser, dtype)
+        precision: Precision = "bfloat16" if dtype == torch.bfloat16 else "float32"
+        denoiser = parse_method(model).denoiser(precision=precision)
+        # Skip shots that lack a buffer which the model needs.
+        buffers = denoiser.model.needs.buffers
+        every = {name: shot for name, shot in shots(dtype).items() if all(buffers <= each.buffers for each in shot)}
+        # Decisions about the whole image, such as to skip it, are the same in every dtype: one sees each shot alone.
+        for batch in [{name: shot} for name, shot in every.items()] if dtype == dtypes[0] else _batches(every):
+            for name, message in _invalid(denoiser, batch).items():
+                yield found(name, dtype, VALID_SHOT, message=message)
+        if not buffers <= frame(0, dtype).buffers:
+            continue
+        if dtype == torch.float32:
+            for name, message in _without_derivatives(model, {name: every[name] for name in _DIFFERENTIATED}).items():
+                yield found(name, dtype, "gradient", message=message)
+        # A denoiser computes in float32 with frames of either dtype.
+        if dtype != torch.float16 or torch.float32 not in dtypes:
+            for exposure, errors in _exposed(denoiser, dtype):
+                yield found(f"exposure {exposure:g}", dtype, "exposure", *errors)
 
 
 def _batches(shots: Shots) -> Iterable[Shots]:
@@ -83,8 +79,8 @@ def _batches(shots: Shots) -> Iterable[Shots]:
     return alike.values()
 
 
-def _valid(denoiser: Denoiser, shots: Shots, dtype: torch.dtype) -> Iterator[Check]:
-    """Every image is finite and non-negative."""
+def _invalid(denoiser: Denoiser, shots: Shots) -> dict[str, str]:
+    """Where an image of a shot is not finite and non-negative; empty if all are."""
     denoiser.reset()
     messages = dict.fromkeys(shots, "")
     for number, frames in enumerate(zip(*shots.values(), strict=True)):
@@ -94,12 +90,12 @@ def _valid(denoiser: Denoiser, shots: Shots, dtype: torch.dtype) -> Iterator[Che
         for name, image in zip(shots, images, strict=True):
             if not torch.isfinite(image).all() or not (image >= 0).all():
                 messages[name] = messages[name] or f"frame {number}: NaN, infinite or negative pixels"
-    for name, message in messages.items():
-        yield bounded("Denoiser", name, dtype, VALID_SHOT, message=message)
+    return messages
 
 
-def _gradients(model: str, shots: Shots) -> Iterator[Check]:
-    """Derivatives of the last image in all buffers of all frames are finite; no checks of a model that has none."""
+def _without_derivatives(model: str, shots: Shots) -> dict[str, str]:
+    """Whether derivatives of a shot's last image in all its buffers are not finite; no shots if the model has none."""
+    messages: dict[str, str] = {}
     denoiser = parse_method(model).denoiser(differentiable=True)
     for batch in _batches(shots):
         denoiser.reset()
@@ -111,19 +107,18 @@ def _gradients(model: str, shots: Shots) -> Iterator[Check]:
                 image = denoiser(frame)
         except InputError:
             # A library without derivatives.
-            return
+            return messages
         if not image.requires_grad:
-            return
+            return messages
         found = torch.autograd.grad(image.sum(), leaves, allow_unused=True)
         for index, name in enumerate(batch):
             finite = all(bool(gradient[index].isfinite().all()) for gradient in found if gradient is not None)
-            yield bounded(
-                "Denoiser", name, torch.float32, "gradient", message="" if finite else "a gradient is NaN or infinite"
-            )
+            messages[name] = "" if finite else "a gradient is NaN or infinite"
+    return messages
 
 
-def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
-    """``denoise(s x) = s denoise(x)``, after a history.
+def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[tuple[float, tuple[float, float, float]]]:
+    """``denoise(s x) = s denoise(x)``, after a history: by exposure the error, its bound, and that of rounding.
 
     Scaling rounds every pixel of every frame, and each stage rounds again. So does a change of all colors, albedos and
     normals by ``eps`` relatively, up or down, and the bound is a multiple of what it does to the image. In a deep
@@ -152,7 +147,7 @@ def _exposed(denoiser: Denoiser, dtype: torch.dtype) -> Iterator[Check]:
             for name in {OIDN, OIDN_CLEAN} & output.stages.keys()
         )
         allowed = ALLOWED * max(largest, _LEAST) + max(library, default=0.0)
-        yield bounded("Denoiser", f"exposure {exposure:g}", dtype, "exposure", found, allowed, largest)
+        yield exposure, (found, allowed, largest)
 
 
 def _moved(frame: Frame, eps: float, seed: int) -> Frame:

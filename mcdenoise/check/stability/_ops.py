@@ -39,8 +39,7 @@ from torch import Tensor
 
 from mcdenoise.check import gradients
 from mcdenoise.check.case import Case, Op, map_tensors, tensors_in
-from mcdenoise.check.cases import OPS, STEPS
-from mcdenoise.check.own import find_ops, op_of
+from mcdenoise.check.own import op_of
 from mcdenoise.check.stability._check import DTYPES, Check, bounded
 from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.stability._trial import Function, Trial, backends
@@ -63,17 +62,6 @@ class _Exact:
     value: Tensor
     condition: Tensor
     bound: Tensor
-
-
-def select(names: Sequence[str] | None = None) -> list[Op]:
-    """Find ops by name, or functions of your own, ``path/to/file.py:function``; ``None`` means all ops.
-
-    Raises:
-        InputError: there is no such op or function, or the function runs on none of its example inputs.
-    """
-    # Steps without a batch axis cannot be checked on many inputs at once.
-    every = OPS + tuple(step for step in STEPS if step.batched)
-    return list(every) if names is None else find_ops(names, every)
 
 
 def check_op(op: Op, dtypes: Sequence[torch.dtype] = DTYPES) -> Iterator[Check]:
@@ -167,7 +155,7 @@ def _exact_results(trial: Trial, results: list[Tensor]) -> list[_Exact]:
     values = {name: value for name, value in inputs.items() if name in trial.numbers}
     values |= {name: value for name, value in rounded.items() if name in values}
     magnitudes = tensors_in(map_tensors(lambda tensor: tensor.abs() + tiny, values))
-    conditions = _conditions(trial.run, leaves, magnitudes, trial.inner, at_once=trial.op.batched)
+    conditions = _conditions(trial.run, leaves, magnitudes, trial.inner, at_once=not trial.op.own)
     return [
         _bounded(value, condition + lost, fan_in, trial.inner, result.dtype)
         for value, result, (condition, fan_in) in zip(trial.run(leaves), results, conditions, strict=True)
@@ -179,7 +167,7 @@ def _exact_gradients(trial: Trial, leaves: list[Tensor], results: list[_Exact]) 
     exact = [leaf.double() for leaf in leaves]
     if trial.op.own:
         magnitudes = [leaf.abs() + torch.finfo(trial.dtype).tiny for leaf in exact]
-        conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=trial.op.batched)
+        conditions = _conditions(trial.gradients, exact, magnitudes, trial.dtype, at_once=False)
     else:
         unit = _unit(trial.dtype)
         changes = spread(trial.gradients, exact, trial.dtype, _DRAWS, _ALLOWED)
