@@ -38,6 +38,14 @@ _TICKS, _MIDDLE = (100, 300, 1000, 3000, 10000), 1000
 _BETWEEN = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
 
+class Figures(NamedTuple):
+    """What was measured: errors on unseen takes, and on long ones; milliseconds by name, and precision."""
+
+    takes: Rows
+    long: Rows
+    times: dict[str, list[float]]
+
+
 class Errors(NamedTuple):
     """Geometric means, and the worst, of errors over those of Open Image Denoise's better setting of each take."""
 
@@ -67,9 +75,11 @@ def lines(rows: Iterable[list[str]], heads: list[str]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in [*head, *rows]) + "\n"
 
 
-def table(takes: Rows, times: dict[str, list[float]]) -> str:
+def table(figures: Figures) -> str:
     """Error and run time of all methods."""
-    found = {name: (errors_of(takes, name), min(milliseconds(times, name).values())) for name in METHODS}
+    found = {
+        name: (errors_of(figures.takes, name), min(milliseconds(figures.times, name).values())) for name in METHODS
+    }
     least = [min(column) for column in zip(*(errors for errors, _ in found.values()), strict=True)]
 
     def cells(errors: Errors) -> list[str]:
@@ -80,9 +90,25 @@ def table(takes: Rows, times: dict[str, list[float]]) -> str:
     return lines(rows, ["", "shots: error", "worst", "flicker", "stills: error", "worst", "ms"])
 
 
-def time_table(takes: Rows, times: dict[str, list[float]]) -> str:
+def long_table(figures: Figures) -> str:
+    """Error and flicker of shots of many frames."""
+
+    def of(name: str, key: str) -> list[float]:
+        return ratios(figures.long, name, key, moving=True)
+
+    rows = [
+        [
+            label,
+            *(f"{value:.2f}" for value in (mean(of(name, "smape")), max(of(name, "smape")), mean(of(name, "tsmape")))),
+        ]
+        for name, label in METHODS.items()
+    ]
+    return lines(rows, ["", "error", "worst", "flicker"])
+
+
+def time_table(figures: Figures) -> str:
     """Run times in both precisions."""
-    found = {name: milliseconds(times, name) for name in METHODS}
+    found = {name: milliseconds(figures.times, name) for name in METHODS}
     unit = found[next(iter(METHODS))]["float32"]
     rows = [
         [
@@ -95,25 +121,25 @@ def time_table(takes: Rows, times: dict[str, list[float]]) -> str:
     return lines(rows, ["method", "float32, ms", "bfloat16, ms", "over OIDN fast"])
 
 
-def single_table(takes: Rows, times: dict[str, list[float]]) -> str:
+def single_table(figures: Figures) -> str:
     """Every take: SMAPE of each method."""
-    del times
     rows = []
-    for number, row in sorted(takes.items()):
+    for number, row in sorted(figures.takes.items()):
         values = [row[name]["smape"] for name in METHODS]
         texts = [f"**{value:.4f}**" if value == min(values) else f"{value:.4f}" for value in values]
         rows.append([f"{number}, {'shot' if 'tsmape' in row[OIDN[0]] else 'still'}", *texts])
     return lines(rows, ["take", *METHODS.values()])
 
 
-TABLES: dict[str, Callable[[Rows, dict[str, list[float]]], str]] = {
+TABLES: dict[str, Callable[[Figures], str]] = {
     "errors": table,
+    "long": long_table,
     "times": time_table,
     "takes": single_table,
 }
 
 
-def plot(takes: Rows, times: dict[str, list[float]], path: Path) -> None:
+def plot(figures: Figures, path: Path) -> None:
     """Error over run time, of shots and of stills."""
     from matplotlib.figure import Figure
 
@@ -123,7 +149,8 @@ def plot(takes: Rows, times: dict[str, list[float]], path: Path) -> None:
         figure = Figure((8, 3.6), layout="constrained")
         for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("shots", "stills"), strict=True):
             for name, label in METHODS.items():
-                time, error = min(milliseconds(times, name).values()), getattr(errors_of(takes, name), kind)
+                time = min(milliseconds(figures.times, name).values())
+                error = getattr(errors_of(figures.takes, name), kind)
                 color = "#0072b2" if name.startswith("wild") else "#d55e00"
                 axes.plot(time, error, "o" if name.startswith("wild") else "s", color=color)
                 side = "right" if time > _MIDDLE else "left"
@@ -140,22 +167,23 @@ def plot(takes: Rows, times: dict[str, list[float]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("figures", type=Path, metavar="FOLDER", help="with takes.json and run-time.json")
+    parser.add_argument("figures", type=Path, metavar="FOLDER", help="with takes.json, long.json and run-time.json")
     parser.add_argument("--pages", type=Path, default=Path(), metavar="FOLDER", help="where README.md and docs are")
     parser.add_argument("--check", action="store_true", help="only compare the pages with the figures")
     options = parser.parse_args()
-    takes = json.loads(read_text(options.figures / "takes.json"))
+    takes, long = (json.loads(read_text(options.figures / name)) for name in ("takes.json", "long.json"))
     times = json.loads(read_text(options.figures / "run-time.json"))["milliseconds"]
     times = {name.replace(", auxiliary", ",auxiliary"): values for name, values in times.items()}
+    figures = Figures(takes, long, times)
     for name in PAGES:
         before = read_text(options.pages / name)
-        after = _BETWEEN.sub(lambda found: found[1] + TABLES[found[2]](takes, times) + found[3], before)
+        after = _BETWEEN.sub(lambda found: found[1] + TABLES[found[2]](figures) + found[3], before)
         if options.check and after != before:
             raise InputError(f"{name}: expected the tables of {options.figures}, found others; run make figures")
         if after != before:
             write_text(options.pages / name, after)
     if not options.check:
-        plot(takes, times, options.pages / PLOT)
+        plot(figures, options.pages / PLOT)
 
 
 if __name__ == "__main__":

@@ -55,7 +55,8 @@ def test_a_changed_figure_is_found_and_mended(figures, monkeypatch, tmp_path: Pa
     times = json.loads((ROOT / "benchmarks" / "run-time.json").read_text("utf-8"))
     times["milliseconds"]["wild"] = [123456.0] * 5
     (folder / "run-time.json").write_text(json.dumps(times), "utf-8")
-    (folder / "takes.json").write_text((ROOT / "benchmarks" / "takes.json").read_text("utf-8"), "utf-8")
+    for name in ("takes.json", "long.json"):
+        (folder / name).write_text((ROOT / "benchmarks" / name).read_text("utf-8"), "utf-8")
     pages = str(tmp_path)
     with pytest.raises(InputError, match="performance"):
         run(figures, monkeypatch, str(folder), "--pages", pages, "--check")
