@@ -19,6 +19,7 @@ from mcdenoise.scenes.assets import Assets, default_folder, open_assets
 from mcdenoise.scenes.generation import SequencePlan
 from mcdenoise.scenes.render import choose_variant
 from mcdenoise.scenes.takes import Plan, TakePlan
+from mcdenoise.scenes.takes.tracing import stratified
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _FRAMES = 12
@@ -58,7 +59,8 @@ def generate(
         takes: packed takes instead of sequences, OUT/000000.take.npz, ... --seeds are their numbers. A third are
             stills, the others have 16 frames with references on the last three. Pixel filter, lens, features and
             samples are drawn, too. The only other options that count are --plain, --frames, --size, --reference-spp
-            (from 2 on), --variant, --threads and the address of a cluster.
+            (from 2 on; rounded up to a number that can be stratified), --variant, --threads and the address of a
+            cluster.
         plain: takes of one sample at pixel centres, with features without noise, as most papers of interactive
             denoising have them; no stills.
         assets: folder of the models, skies and normal maps, which are fetched to it; by default in the user's cache.
@@ -127,7 +129,7 @@ def _of_takes(rendering: RenderOptions, frames: int) -> dict[str, Any]:
     return {
         **({} if frames == _FRAMES else {"frames": frames}),
         **({"size": parse_size(rendering.size)} if "size" in given else {}),
-        **({"half": rendering.reference_spp // 2} if "reference_spp" in given else {}),
+        **({"half": stratified(rendering.reference_spp // 2)} if "reference_spp" in given else {}),
     }
 
 

@@ -109,6 +109,16 @@ def test_frames_of_a_known_scene_are_known(splatted: bool) -> None:
     assert not np.array_equal(*halves)
 
 
+def test_references_have_as_many_samples_as_can_be_stratified() -> None:
+    mi = pytest.importorskip("mitsuba")
+    from mcdenoise.scenes.takes.tracing import stratified
+
+    mi.set_variant("scalar_rgb")
+    for samples in (1, 5, 48, 127, 128, 133):
+        sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+        assert stratified(samples) == sampler.sample_count()
+
+
 def test_motion_follows_what_moves() -> None:
     moved = np.stack([np.eye(4), np.eye(4)])
     moved[1, 0, 3] = 0.1

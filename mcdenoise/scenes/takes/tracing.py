@@ -123,6 +123,12 @@ class TakeTracer(Tracer):
         return width / 2 - left * scale, height / 2 - up * scale
 
 
+def stratified(samples: int) -> int:
+    """The least number of samples, from this one on, that Mitsuba's multi-jittered sampler can draw: a full grid."""
+    rows = math.isqrt(samples)
+    return rows * -(-samples // rows)
+
+
 def _looks(take: Take) -> dict[str, tuple[float, ...]]:
     """Roughness, and albedo without diffuse reflection, of each shape, as renderers write them."""
     looks: dict[str, tuple[float, ...]] = {}
