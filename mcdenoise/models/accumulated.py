@@ -440,8 +440,7 @@ class Accumulated(Wrapper):
                 f"another method or other layers; {ADVICE}"
             )
         if (history.features is not None) != self.features:
-            found = "without" if self.features else "with"
-            raise InputError(f"state: expected what accumulated keeps, found it {found} accumulated features; {ADVICE}")
+            raise InputError(f"state: expected one of the same settings; {ADVICE}")
         there = [frame.buffer(name) is not None for name in self.also]
         same = there == [part is not None for part in history.carried[now - len(there) :]]
         return "" if same else "other buffers than in the frame before"

@@ -79,7 +79,7 @@ def test_features_are_averaged_over_the_history_where_asked_for() -> None:
         seen = history.watching.frames[-1]
         assert torch.equal(seen.albedo, albedo)
         torch.testing.assert_close(seen.extra[FEATURES][:, :3], albedos[:i].mean(0))
-        assert not seen.extra[FEATURES][:, 3:6].any()
+        assert not seen.extra[FEATURES][:, 3:].any()
     history.reset()
     history.update(still(torch.rand(1, 3, HEIGHT, WIDTH), albedo=albedos[0]))
     assert torch.equal(history.watching.frames[-1].extra[FEATURES][:, :3], albedos[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -226,25 +227,23 @@ def blend(
     tests = not math.isinf(lag_threshold)
     recent_alpha = max(alpha_min, RECENT_ALPHA)
     both = without_history(entering) if tests else entering
-    together = (both, previous)
+    same = (previous_length, motion, surface, previous_surface)
+    rules: dict[str, Any] = {
+        "alpha_min": alpha_min,
+        "rule": rule,
+        "position_limit": position_limit,
+        "normal_limit": normal_limit,
+    }
+    color, length = plain(accumulate)(both, previous, *same, **rules)
     if features is not None and previous_features is not None:
-        # In one call, which finds the taps once.
-        together = (torch.cat([both, features], 1), torch.cat([previous, previous_features], 1))
-    color, length = plain(accumulate)(
-        *(*together, previous_length, motion, surface, previous_surface),
-        alpha_min=alpha_min,
-        rule=rule,
-        position_limit=position_limit,
-        normal_limit=normal_limit,
-    )
-    color, steady = color[:, : both.shape[1]], color[:, both.shape[1] :]
+        features = plain(accumulate)(features, previous_features, *same, **rules)[0]
     pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels
     if albedo is not None and motion is not None and specular_length < math.inf:
         color, length = _shortened(specular_length + 1, alpha_min, both, color, length, albedo, motion)
     if tests:
         color, length = _without_lag(lag_threshold, alpha_min, recent_alpha, both, color, length)
-    return Blended(color, length.to(previous_length.dtype), kept, None if features is None else steady)
+    return Blended(color, length.to(previous_length.dtype), kept, features)
 
 
 def _weight_of_history(length: Tensor, alpha_min: float) -> Tensor:
