@@ -12,7 +12,6 @@ from toys import frame_of
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
-from mcdenoise.models.accumulated import FEATURES
 from mcdenoise.models.wild import _LOGITS, _PACE, Trust, WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -27,9 +26,8 @@ has_oidn = pytest.mark.skipif(
 def given(length: float) -> Frame:
     """A frame with this many frames of history."""
     frame = frame_of(*SIZE).to(torch.float64)
-    drawn = torch.rand(1, 12, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    length_of_all = torch.full((1, 1, *SIZE), length, dtype=torch.float64)
-    return frame.replace(current=drawn[:, 9:], length=length_of_all, extra={FEATURES: drawn[:, :9]})
+    alone = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return frame.replace(current=alone, length=torch.full((1, 1, *SIZE), length, dtype=torch.float64))
 
 
 def network(own: float, logits: tuple[float, ...]) -> WildNetwork:
@@ -54,11 +52,8 @@ def test_the_image_is_the_weighted_mean_of_four_images(length: float | None) -> 
     albedo, alone = frame.albedo, frame.color if frame.current is None else frame.current
     assert albedo is not None
     lit, history = (remodulate(each, albedo) for each in (alone, frame.color))
-    exposure = oidn_exposure(history)
-    # What was accumulated with its albedo.
-    history = history if length is None else torch.lerp(history, frame.extra[FEATURES][:, 6:], 0.7)
     images = [lit, history, torch.lerp(lit, history, 0.7)]
-    part = 0.0 if length is None else 1 - 1 / length
+    exposure, part = oidn_exposure(history), 0.0 if length is None else 1 - 1 / length
     weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
         [1, part, part, 1], dtype=torch.float64
     )
@@ -73,10 +68,9 @@ def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
     trust, flat = Trust().double(), torch.full((1, 3, *SIZE), 0.5, dtype=torch.float64)
     part, noise = torch.full_like(flat[:, :1], 0.9), 0.1 * torch.ones_like(flat)
     noise[..., ::2] *= -1
-    features = torch.cat([torch.ones_like(flat), torch.zeros_like(flat)], 1)
 
     def weight(alone: torch.Tensor) -> torch.Tensor:
-        return trust(alone, flat, flat, part, features, None, None)[0]
+        return trust(alone, flat, part, None, None)
 
     assert weight(flat).shape == (1, 1, *SIZE)
     torch.testing.assert_close(weight(flat + noise), weight(flat - noise))
