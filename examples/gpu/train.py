@@ -74,7 +74,7 @@ class Tiles:
 
     def __post_init__(self) -> None:
         self.fixed = torch.empty(0, sum(CHANNELS.values()), *TILE, dtype=torch.float16, device=self.device)
-        self.history = torch.empty(0, 13, *TILE, dtype=torch.float16, device=self.device)
+        self.history = torch.empty(0, 10, *TILE, dtype=torch.float16, device=self.device)
         self.update()
         if not self.takes:
             raise InputError(f"{self.folder}: expected parts that pack.py has written, found none")
@@ -134,7 +134,7 @@ class Tiles:
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
     """Frames from their channels, and the reference."""
     current, albedo, normal, reference = fixed.split(list(CHANNELS.values()), 1)
-    color, length, features = history.split([3, 1, 9], 1)
+    color, length, features = history.split([3, 1, 6], 1)
     given = {"current": current, "length": length, "albedo": albedo, "normal": normal}
     return Frame(color=color, **given, extra={FEATURES: features}), reference
 

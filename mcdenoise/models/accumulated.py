@@ -19,7 +19,7 @@ from mcdenoise.models._motion import comparable, is_still, motion_unless_still, 
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface, remodulate
+from mcdenoise.ops import Surface
 from mcdenoise.ops._steps.history import (
     COLOR,
     MEAN,
@@ -71,7 +71,7 @@ class History(NamedTuple):
             are no compressed radiance; ``None`` for a buffer that the frame lacked.
         light: ``(B, 1, H, W)`` how much light lasts, see :func:`mcdenoise.models._fireflies.believed`; ``None`` where
             no fireflies are clamped.
-        features: ``(B, 9, H, W)``, see :func:`features_of`; ``None`` where they are not accumulated.
+        features: ``(B, 6, H, W)`` albedo and normal; ``None`` where they are not accumulated.
     """
 
     color: Tensor
@@ -180,10 +180,9 @@ class Accumulated(Wrapper):
         also: names of further buffers to accumulate with the weights of the color, where a frame has them: buffers
             ``(B, 3, H, W)`` of ``frame.extra``, whose fireflies are kept; or ``"diffuse"`` and ``"specular"``, which
             the method sees accumulated.
-        features: whether the method also sees albedo, normal, and the radiance times the albedo as means over the
-            history, with the weights of :func:`mcdenoise.ops.accumulate`: the buffer ``accumulated_features`` of
-            ``frame.extra``, ``(B, 9, H, W)``. A missing albedo counts as one, a missing normal as zero. Where pixels
-            show two surfaces, this radiance has smooth edges, and the one without its albedo has not.
+        features: whether the method also sees albedo and normal with less noise, as the buffer
+            ``accumulated_features`` of ``frame.extra``, ``(B, 6, H, W)``: the mean over the history, with the weights
+            of :func:`mcdenoise.ops.accumulate`. A missing albedo counts as one, a missing normal as zero.
 
     Raises:
         InputError: a setting is out of its range.
@@ -288,7 +287,7 @@ class Accumulated(Wrapper):
             return self._begun(frame, entering, limit, seen, reset)
         still = is_still(frame, history.view_projection)
         motion = motion_unless_still(frame, history.view_projection, still)
-        own = features_of(frame, entering[:, COLOR]) if self.features else None
+        own = features_of(frame).to(entering.dtype) if self.features else None
         color, length, kept, features = self._blend(frame, entering, history.color, seen, history, motion, own)
         found = kept.mean()
         cut = found < CUT_FRACTION
@@ -321,10 +320,7 @@ class Accumulated(Wrapper):
     def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
         """A frame without a history."""
         color, length = without_history(entering), torch.ones_like(entering[:, :1])
-        carried, features = (
-            self._first(frame, entering),
-            features_of(frame, entering[:, COLOR]) if self.features else None,
-        )
+        carried, features = self._first(frame, entering), features_of(frame).to(color.dtype) if self.features else None
         begun = _Blended(color, length, carried, entering, limit, limit, seen, None, False, reset)
         return begun._replace(features=features)
 
@@ -464,11 +460,11 @@ class Accumulated(Wrapper):
         ]
 
 
-def features_of(frame: Frame, color: Tensor) -> Tensor:
-    """Albedo, normal, and radiance times the albedo, ``(B, 9, H, W)`` in the dtype of the radiance."""
+def features_of(frame: Frame) -> Tensor:
+    """Albedo and normal, ``(B, 6, H, W)``; one and zero where they are missing."""
     albedo = torch.ones_like(frame.color) if frame.albedo is None else frame.albedo
     normal = torch.zeros_like(frame.color) if frame.normal is None else frame.normal
-    return torch.cat([albedo, normal, remodulate(color, albedo.to(color.dtype))], 1).to(color.dtype)
+    return torch.cat([albedo, normal], 1)
 
 
 def _misfit(history: History, frame: Frame) -> str:

@@ -4,9 +4,8 @@ The layers are those of Open Image Denoise, and can start with the weights that 
 the library's noisy image they see a mean of the frame and of the accumulated radiance, which holds the samples of all
 frames that showed the same surface. A small network weighs both: the history has less noise, but is late or blurred
 where light changes and where pixels move by fractions. Beside it the layers see the frame, the accumulated radiance,
-and how long the history is. Albedo and normal are accumulated, too, since most renderers write them with noise; the
-layers see them and those of the frame, which show more detail where they have none. Each pixel of the result is a
-weighted mean of the network's own image and of these, so the error falls with every sample.
+and how long the history is. Each pixel of the result is a weighted mean of the network's own image and of these, so the
+error falls with every sample.
 """
 
 from __future__ import annotations
@@ -40,24 +39,19 @@ _CHANNELS = 9 + 3 + 3 + 1 + 6
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -12.0  # that of the network's image, while its weights are random
 _PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
-# The network for the weights of the history: side of the blocks that it sees, channels, and the initial logits.
-_BLOCK, _WIDTH, _TRUST, _LIT = 4, 24, 1.5, -0.5
-_FIGURES = 15
+# The network for the weight of the history: side of the blocks that it sees, channels, and the initial logit.
+_BLOCK, _WIDTH, _TRUST = 4, 24, 1.5
+_FIGURES = 11
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
 
 class Trust(nn.Module):
     """The weight of the accumulated radiance beside the frame, from what both show in blocks of 4x4 pixels.
 
-    The radiance is accumulated twice, without its albedo and with it: the first is sharp where the features have no
-    noise, the second has smooth edges where each sample has features of its own. A second weight is that of the second.
-
     Of each block it sees the means of both, the mean absolute difference, the difference of the means, both standard
     deviations, and the part of the history: a difference of single pixels is noise, one of means is late light. And the
     standard deviations of albedo and normal, and how many pixels show a surface at all: a background has no noise, and
-    radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes. And how far
-    the features are from the accumulated ones, which tells their noise, and both kinds of accumulated radiance from
-    each other.
+    radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes.
     """
 
     reach = 3 * _BLOCK + 2 * _BLOCK
@@ -67,55 +61,40 @@ class Trust(nn.Module):
         layers: list[nn.Module] = []
         for entering in (_FIGURES, _WIDTH, _WIDTH):
             layers += [nn.Conv2d(entering, _WIDTH, 3, padding=1, padding_mode="replicate"), nn.ReLU()]
-        self.layers, self.last = nn.Sequential(*layers), nn.Conv2d(_WIDTH, 2, 1)
+        self.layers, self.last = nn.Sequential(*layers), nn.Conv2d(_WIDTH, 1, 1)
         assert self.last.bias is not None
         with torch.no_grad():
             self.last.weight.mul_(0.1 / _PACE)
-            self.last.bias.copy_(torch.tensor([_TRUST, _LIT]) / _PACE)
+            self.last.bias.fill_(_TRUST / _PACE)
 
     def forward(
-        self,
-        alone: Tensor,
-        color: Tensor,
-        lit: Tensor,
-        part: Tensor,
-        features: Tensor,
-        albedo: Tensor | None,
-        normal: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Both weights, ``(B, 1, H, W)`` each.
+        self, alone: Tensor, color: Tensor, part: Tensor, albedo: Tensor | None, normal: Tensor | None
+    ) -> Tensor:
+        """The weight ``(B, 1, H, W)``.
 
         Args:
             alone: ``(B, 3, H, W)`` the frame, in [0, 1] on the library's scale.
-            color: ``(B, 3, H, W)`` likewise, the radiance accumulated without its albedo, times that of the frame.
-            lit: ``(B, 3, H, W)`` likewise, accumulated with its albedo.
-            features: ``(B, 6 or more, H, W)`` accumulated albedo and normal.
+            color: ``(B, 3, H, W)`` likewise, the accumulated radiance.
             part: ``(B, 1, H, W)`` part of the history in it.
             albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
             normal: likewise; ``None`` counts as zero.
         """
         albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0, 1)
         normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1, 1)
-        own, both, with_it, surface = (image.mean(1, keepdim=True) for image in (alone, color, lit, albedo))
-        noise = [
-            (a - b).abs().mean(1, keepdim=True)
-            for a, b in zip((albedo, normal), features[:, :6].split(3, 1), strict=True)
-        ]
+        own, both, surface = (image.mean(1, keepdim=True) for image in (alone, color, albedo))
         apart, lengths = (own - both).abs(), normal.square().sum(1, keepdim=True)
-        products = [own * own, both * both, surface * surface]
-        others = [*noise, (with_it - both).abs(), with_it - both]
-        each = torch.cat([own, both, surface, *products, apart, part, lengths, normal, *others], 1)
+        each = torch.cat(
+            [own, both, surface, own * own, both * both, surface * surface, apart, part, lengths, normal], 1
+        )
         blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
-        means, squares, apart, part, lengths, normal, others = blocks.split([3, 3, 1, 1, 1, 3, 4], 1)
+        means, squares, apart, part, lengths, normal = blocks.split([3, 3, 1, 1, 1, 3], 1)
         variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
         own, both, _ = means.split(1, 1)
         differences = torch.cat([apart, (own - both).abs(), variances.clamp_min(_LEAST**2).sqrt()], 1)
-        logs = [(each + _LEAST).log() / 2 for each in (differences, others.abs())]
-        seen = [own, both, logs[0], part, (1.02 - part).log() / 2, lengths, logs[1]]
+        seen = [own, both, (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
         logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
         wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
-        trust, smooth = corner(wide, *alone.shape[-2:]).split(1, 1)
-        return trust, smooth
+        return corner(wide, *alone.shape[-2:])
 
 
 class WildNetwork(nn.Module):
@@ -155,17 +134,14 @@ class WildNetwork(nn.Module):
         color, albedo = frame.color, frame.albedo
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
         alone = color if frame.current is None else frame.current.to(color.dtype)
-        features = frame.extra[FEATURES].to(color.dtype) if FEATURES in frame.extra else features_of(frame, color)
-        guides = (features, albedo, frame.normal)
         history, alone = _lit(frame, color), _lit(frame, alone)
         mean, part = history, torch.zeros_like(color[:, :1])
         if frame.length is not None:
             part = (1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
-            smooth = features[:, 6:]
-            shown = (compress(image * exposure) for image in (alone, history, smooth))
-            trust, share = self.trust(*shown, part, *guides)
-            history = torch.lerp(history, smooth, share)
-            mean = torch.lerp(alone, history, trust)
+            shown = (compress(image * exposure) for image in (alone, history))
+            mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
+        features = frame.extra[FEATURES] if FEATURES in frame.extra else features_of(frame)
+        guides = (features.to(color.dtype), albedo, frame.normal)
         seen, images = wild_input(mean, alone, history, *guides, part, exposure, self.needs.stride)
         image, logits = corner(self.unet(seen), *frame.size).split([3, len(_LOGITS)], 1)
         predicted = torch.cat([image, _PACE * logits], 1)
@@ -198,9 +174,8 @@ def _wild(
     model = Skipping(Tiled(WildNetwork(size)), tolerance, alpha_min)
     threshold = THRESHOLD if anti_lag else math.inf
     # Clamped fireflies are light that the network would have to guess: stills had a tenth more error.
-    return Demodulated(
-        Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold, features=True)
-    )
+    settings = {"alpha_min": alpha_min, "firefly_limit": math.inf, "lag_threshold": threshold}
+    return Demodulated(Accumulated(model, **settings, features=True))
 
 
 register_family(

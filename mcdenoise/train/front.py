@@ -48,7 +48,7 @@ class Front:
         """Names and channels of the buffers that depend on the noise seed: radiance, and histories."""
         accumulated = ACCUMULATED if self.accumulates else {"color": 3}
         if any(settings.get("features") for _, settings in self.wrappers):
-            accumulated = {**accumulated, FEATURES: 9}
+            accumulated = {**accumulated, FEATURES: 6}
         return {**accumulated, **dict.fromkeys(self.given, 3), **(GIVEN if self._has(WithOidn) else {})}
 
     def of(self, buffers: Collection[str]) -> Front:

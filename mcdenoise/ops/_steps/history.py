@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -228,14 +227,9 @@ def blend(
     recent_alpha = max(alpha_min, RECENT_ALPHA)
     both = without_history(entering) if tests else entering
     same = (previous_length, motion, surface, previous_surface)
-    rules: dict[str, Any] = {
-        "alpha_min": alpha_min,
-        "rule": rule,
-        "position_limit": position_limit,
-        "normal_limit": normal_limit,
-    }
+    rules = {"alpha_min": alpha_min, "rule": rule, "position_limit": position_limit, "normal_limit": normal_limit}
     color, length = plain(accumulate)(both, previous, *same, **rules)
-    if features is not None and previous_features is not None:
+    if features is not None:
         features = plain(accumulate)(features, previous_features, *same, **rules)[0]
     pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels

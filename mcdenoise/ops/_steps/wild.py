@@ -31,7 +31,7 @@ def wild_input(
         color: ``(B, 3, H, W)`` radiance, a mean of the frame and its history.
         alone: ``(B, 3, H, W)`` radiance of the frame.
         history: ``(B, 3, H, W)`` accumulated radiance.
-        features: ``(B, 6 or more, H, W)`` accumulated albedo and normal, are clamped as those of the frame.
+        features: ``(B, 6, H, W)`` accumulated albedo and normal, are clamped as those of the frame.
         albedo: ``(B, 3, H, W)``, is clamped to [0, 1]; ``None`` counts as one.
         normal: ``(B, 3, H, W)``, is clamped to [-1, 1]; ``None`` counts as zero.
         part: ``(B, 1, H, W)`` part of the history in the accumulated radiance.
@@ -48,7 +48,7 @@ def wild_input(
     albedo = torch.ones_like(color) if albedo is None else albedo
     normal = torch.zeros_like(color) if normal is None else normal
     mean, others = images.split([3, 6], 1)
-    steady, own = seen_by_oidn(mean, features[:, :3], features[:, 3:6]), seen_by_oidn(part, albedo, normal)
+    steady, own = seen_by_oidn(mean, features[:, :3], features[:, 3:]), seen_by_oidn(part, albedo, normal)
     seen = torch.cat([steady, others, own], 1)
     return up_to_multiple(seen, multiple), images
 
