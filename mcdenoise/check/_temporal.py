@@ -340,10 +340,8 @@ STEPS = (
             "previous_length": Argument(between(1.0, 6.0), 1),
             # Stay away from whole pixels, where the derivative jumps.
             "motion": Argument(between(0.1, 0.4), 2),
-            "features": _COLOR,
-            "previous_features": _COLOR,
         },
-        ("entering", "previous", "motion", "features", "previous_features"),
+        ("entering", "previous", "motion"),
         rounds=motion_rounds,
     ),
 )

@@ -19,14 +19,13 @@ from mcdenoise.models._motion import comparable, is_still, motion_unless_still, 
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface
+from mcdenoise.ops import Surface, accumulate
 from mcdenoise.ops._steps.history import (
     COLOR,
     MEAN,
     RECENT,
     RECENT_MEAN,
     SQUARE,
-    Blended,
     blend,
     incoming,
     lights,
@@ -287,8 +286,7 @@ class Accumulated(Wrapper):
             return self._begun(frame, entering, limit, seen, reset)
         still = is_still(frame, history.view_projection)
         motion = motion_unless_still(frame, history.view_projection, still)
-        own = features_of(frame).to(entering.dtype) if self.features else None
-        color, length, kept, features = self._blend(frame, entering, history.color, seen, history, motion, own)
+        color, length, kept = self._blend(frame, entering, history.color, seen, history, motion)
         found = kept.mean()
         cut = found < CUT_FRACTION
         if not blind and cut:
@@ -298,6 +296,7 @@ class Accumulated(Wrapper):
                 limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
             return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
+        features = self._blend_features(frame, history, motion)
         made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found, None, features)
         if not blind:
             return made
@@ -306,8 +305,8 @@ class Accumulated(Wrapper):
             for part, old in zip(self._first(frame, entering), carried, strict=True)
         )
         color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
-        if own is not None and features is not None:
-            features = torch.where(cut, own, features)
+        if features is not None:
+            features = torch.where(cut, features_of(frame).to(entering.dtype), features)
         return made._replace(
             color=color,
             length=length,
@@ -366,10 +365,27 @@ class Accumulated(Wrapper):
             previous = [before[:, COLOR], history.color[:, MEAN.start : SQUARE.stop], before[:, COLOR.stop :]]
             previous = [*previous, history.color[:, RECENT_MEAN]] if decisive.shape[1] else previous
             together = torch.cat([part, decisive], 1), torch.cat(previous, 1)
-            color = self._blend(frame, *together, seen, history, motion).color
+            color = self._blend(frame, *together, seen, history, motion)[0]
             recent = color[:, RECENT.start : RECENT_MEAN.start]
             blended.append(torch.cat([color[:, COLOR], recent], 1) if decisive.shape[1] else color)
         return tuple(blended)
+
+    def _blend_features(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor | None:
+        """Albedo and normal of a frame with their history, which no change of light shortens."""
+        if history.features is None:
+            return None
+        features, (surface, previous) = features_of(frame).to(history.features.dtype), self._surfaces(frame, history)
+        limits = {"position_limit": self.position_limit, "normal_limit": self.normal_limit}
+        return accumulate(
+            *(features, history.features, history.length, motion, surface, previous),
+            alpha_min=self.alpha_min,
+            rule=self.rule,
+            **limits,
+        )[0]
+
+    def _surfaces(self, frame: Frame, history: History) -> tuple[Surface, Surface]:
+        surfaces = surface_before(frame), history.surface
+        return comparable(*surfaces) if self.rule == "relative" else surfaces
 
     def _blend(
         self,
@@ -379,13 +395,11 @@ class Accumulated(Wrapper):
         seen: Tensor | None,
         history: History,
         motion: Tensor | None,
-        features: Tensor | None = None,
-    ) -> Blended:
-        surface, previous = surface_before(frame)._replace(label=seen), history.surface
-        if self.rule == "relative":
-            surface, previous = comparable(surface, previous)
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Color and length of the frame with its history, and how many pixels of each image have one."""
+        surface, previous = self._surfaces(frame, history)
         return blend(
-            *(entering, before, history.length, motion, surface, previous),
+            *(entering, before, history.length, motion, surface._replace(label=seen), previous),
             alpha_min=self.alpha_min,
             rule=self.rule,
             position_limit=self.position_limit,
@@ -393,8 +407,6 @@ class Accumulated(Wrapper):
             albedo=frame.albedo,
             specular_length=self.specular_length,
             lag_threshold=self.lag_threshold,
-            features=features,
-            previous_features=None if features is None else history.features,
         )
 
     def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor | None]:

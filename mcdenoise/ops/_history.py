@@ -18,10 +18,8 @@ class Blended(NamedTuple):
         color: ``(B, C, H, W)``, the channels of a history.
         length: ``(B, 1, H, W)`` of the history with this frame, in frames.
         kept: ``(B,)`` fraction of each image's pixels that found their surface in the previous frame, float32.
-        features: ``(B, N, H, W)`` accumulated features, in their dtype; ``None`` if there are none.
     """
 
     color: Tensor
     length: Tensor
     kept: Tensor
-    features: Tensor | None = None

@@ -35,7 +35,6 @@ class Past(NamedTuple):
     current: Tensor
     length: Tensor
     kept: Tensor
-    features: Tensor
 
 
 def camera(shift: float) -> Tensor:
@@ -94,7 +93,7 @@ def passed(
 ) -> list[Past]:
     """Every frame of a shot with its past."""
     results: list[Past] = []
-    before, history, length, features = Surface(), torch.empty(0), torch.empty(0), torch.empty(0)
+    before, history, length = Surface(), torch.empty(0), torch.empty(0)
     tests = lag_threshold < math.inf
     for number, frame in enumerate(frames):
         position = frame.position
@@ -105,7 +104,7 @@ def passed(
             seen = steps.lights(entering[:, steps.MEAN]) if tests else None
             if number == 0:
                 history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])
-                kept, features = torch.zeros(len(length)), frame.color
+                kept = torch.zeros(len(length))
             else:
                 motion = frame.motion
                 past = position if frame.previous_position is None or position is None else frame.previous_position
@@ -113,19 +112,15 @@ def passed(
                     camera = frames[number - 1].view_projection
                     assert camera is not None
                     motion = motion_from_position(past, camera)
-                history, length, kept, accumulated = steps.blend(
+                history, length, kept = steps.blend(
                     *(entering, history, length, motion, Surface(past, frame.normal, depth, seen), before),
                     **(rule or {}),
                     albedo=frame.albedo,
                     specular_length=specular_length,
                     lag_threshold=lag_threshold,
-                    features=frame.color,
-                    previous_features=features,
                 )
-                assert accumulated is not None
-                features = accumulated
         before = Surface(position, frame.normal, depth, seen)
-        results.append(Past(history[:, steps.COLOR].clone(), entering[:, steps.COLOR], length.clone(), kept, features))
+        results.append(Past(history[:, steps.COLOR].clone(), entering[:, steps.COLOR], length.clone(), kept))
     return results
 
 

@@ -177,21 +177,17 @@ def blend(
     albedo: Tensor | None,
     specular_length: float,
     lag_threshold: float,
-    features: Tensor | None,
-    previous_features: Tensor | None,
 ) -> Blended:
     """See :func:`mcdenoise.ops._steps.history.blend`."""
     recent_alpha = max(alpha_min, RECENT_ALPHA)
-    color, length, counts, steady = blended(
+    color, length, counts = blended(
         *(entering, previous, previous_length, motion, surface, previous_surface),
         *(alpha_min, rule, position_limit, normal_limit),
         Shorter(recent_alpha, albedo, specular_length + 1),
-        *(features, previous_features),
     )
     if not math.isinf(lag_threshold):
         _discard_lag(color, length, entering, lag_threshold, recent_alpha)
-    kept = counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1)
-    return Blended(color, length, kept, None if features is None else steady)
+    return Blended(color, length, counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1))
 
 
 def _discard_lag(history: Tensor, length: Tensor, color: Tensor, threshold: float, recent_alpha: float) -> None:

@@ -74,31 +74,24 @@ def blended(
     position_limit: float | None,
     normal_limit: float | None,
     shorter: Shorter = Shorter(),  # noqa: B008
-    features: Tensor | None = None,
-    previous_features: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """As ``accumulate``, with a history that is shorter in places or channels; and how many pixels of a row have one.
 
-    The features, if there are any, have the whole history. Channels that ``previous`` has more than ``color`` are the
-    second history of the first of them.
+    Channels that ``previous`` has more than ``color`` are the second history of the first of them.
     """
     dtype = torch.promote_types(color.dtype, torch.float32)
     batch, _, height, _ = previous.shape
     result = torch.empty(previous.shape, dtype=dtype, device="cpu")
     length = torch.empty(previous_length.shape, dtype=dtype, device="cpu")
     kept = torch.zeros(batch, height, dtype=torch.int64, device="cpu")
-    shape = (batch, 0 if features is None else features.shape[1], *previous.shape[2:])
-    steady = torch.empty(shape, dtype=dtype, device="cpu")
     if result.numel():
         taps = _taps(dtype, motion, surface, previous_surface, rule, position_limit, normal_limit)
-        read = (previous, previous_length, color, previous_features, features, shorter.albedo)
-        images = (_planes(image, dtype) for image in read)
+        images = (_planes(image, dtype) for image in (previous, previous_length, color, shorter.albedo))
         # In the dtype of the sums: a number in double precision would make the sums so.
         settings = result.new_tensor([alpha_min, shorter.recent_alpha, shorter.longest, NO_ALBEDO, STILL**2]).numpy()
-        arguments = (result.numpy(), length.numpy(), kept.numpy(), steady.numpy(), *images, settings, *taps)
+        arguments = (result.numpy(), length.numpy(), kept.numpy(), *images, settings, *taps)
         share_rows(previous, lambda *rows: _blend(*arguments, *rows))
-    steady = steady if features is None else steady.to(features.dtype)
-    return result.to(color.dtype), length.to(previous_length.dtype), kept, steady
+    return result.to(color.dtype), length.to(previous_length.dtype), kept
 
 
 def _planes(image: Tensor | None, dtype: torch.dtype) -> Any:
@@ -156,12 +149,9 @@ def _blend(
     result: Any,
     lengths: Any,
     counts: Any,
-    steady: Any,
     previous: Any,
     previous_length: Any,
     color: Any,
-    previous_features: Any,
-    features: Any,
     albedo: Any,
     settings: Any,
     motion: Any,
@@ -189,9 +179,6 @@ def _blend(
             _sum_taps(lengths, found, weights, places, previous_length, b, y, x0)
             length = lengths[b, 0, y, x0:x1]
             counts[b, y] += _weigh(alpha, length, found, settings, bmfr)
-            _sum_taps(steady, found, weights, places, previous_features, b, y, x0)
-            for c in range(features.shape[1]):
-                _blend_run(steady[b, c, y, x0:x1], features[b, c, start:end], alpha, found)
             if albedo.shape[1] and motion.shape[1]:
                 _shorten(alpha, length, albedo, motion, settings, b, start)
             if channels > fresh:

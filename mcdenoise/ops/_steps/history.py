@@ -141,8 +141,6 @@ def _check_blend(
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
-    features: Tensor | None = None,
-    previous_features: Tensor | None = None,
 ) -> None:
     if not specular_length >= 0:
         raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
@@ -151,11 +149,7 @@ def _check_blend(
         entering=(entering, f"B {channels[0]} H W"),
         previous=(previous, f"B {channels[1]} H W"),
         **({} if albedo is None else {"albedo": (albedo, "B 3 H W")}),
-        **({} if features is None else {"features": (features, "B N H W")}),
-        **({} if previous_features is None else {"previous_features": (previous_features, "B N H W")}),
     )
-    if (features is None) != (previous_features is None):
-        raise ValueError("previous_features: expected those of the previous frame, found features of one frame only")
     check_accumulate(
         *(previous, previous, previous_length, motion, surface, previous_surface),
         alpha_min=alpha_min,
@@ -181,8 +175,6 @@ def blend(
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
-    features: Tensor | None = None,
-    previous_features: Tensor | None = None,
 ) -> Blended:
     """Accumulate a frame, with a shorter history where that is known to be wrong.
 
@@ -211,33 +203,31 @@ def blend(
         albedo: ``(B, 3, H, W)``, which says where mirrors and glass are; without it no history is shortened for them.
         specular_length: in frames, at least 0.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test.
-        features: ``(B, N, H, W)`` buffers to accumulate as well, without 2 and 3: what they show does not depend on the
-            light.
-        previous_features: ``(B, N, H, W)`` those of the previous frame.
 
     Returns:
         See :class:`Blended`; the dtypes of ``entering`` and of ``previous_length``.
 
     Raises:
         TypeError: as :func:`mcdenoise.ops.accumulate`.
-        ValueError: as :func:`mcdenoise.ops.accumulate`, or ``specular_length`` is negative, or only one of both frames
-            has features.
+        ValueError: as :func:`mcdenoise.ops.accumulate`, or ``specular_length`` is negative.
     """
     tests = not math.isinf(lag_threshold)
     recent_alpha = max(alpha_min, RECENT_ALPHA)
     both = without_history(entering) if tests else entering
-    same = (previous_length, motion, surface, previous_surface)
-    rules = {"alpha_min": alpha_min, "rule": rule, "position_limit": position_limit, "normal_limit": normal_limit}
-    color, length = plain(accumulate)(both, previous, *same, **rules)
-    if features is not None:
-        features = plain(accumulate)(features, previous_features, *same, **rules)[0]
+    color, length = plain(accumulate)(
+        *(both, previous, previous_length, motion, surface, previous_surface),
+        alpha_min=alpha_min,
+        rule=rule,
+        position_limit=position_limit,
+        normal_limit=normal_limit,
+    )
     pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels
     if albedo is not None and motion is not None and specular_length < math.inf:
         color, length = _shortened(specular_length + 1, alpha_min, both, color, length, albedo, motion)
     if tests:
         color, length = _without_lag(lag_threshold, alpha_min, recent_alpha, both, color, length)
-    return Blended(color, length.to(previous_length.dtype), kept, features)
+    return Blended(color, length.to(previous_length.dtype), kept)
 
 
 def _weight_of_history(length: Tensor, alpha_min: float) -> Tensor:

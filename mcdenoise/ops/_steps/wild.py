@@ -40,9 +40,8 @@ def wild_input(
 
     Returns:
         ``(B, 22, H', W')`` the mean on the scale, accumulated albedo, accumulated normal in [0, 1], the frame and the
-        accumulated radiance on the scale, part, the frame's albedo and normal; and ``(B, 9, H, W)`` the three images of
-        radiance on the scale. The fast backend writes the input as a convolution takes it: channels-last, in the
-        precision of autocast.
+        accumulated radiance on the scale, part, the frame's albedo and normal; and ``(B, 9, H, W)`` the three images of radiance on the scale. The fast backend writes the
+        input as a convolution takes it: channels-last, in the precision of autocast.
     """
     images = compress(torch.cat([color, alone, history], 1) * exposure)
     albedo = torch.ones_like(color) if albedo is None else albedo
