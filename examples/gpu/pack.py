@@ -20,14 +20,13 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.data.shards import Shard
 from mcdenoise.errors import run_script
 from mcdenoise.models import create_model
-from mcdenoise.models.accumulated import FEATURES
 from mcdenoise.train.data import describe_takes, open_takes
 from mcdenoise.train.footage import shots_of
 from mcdenoise.train.front import Front, split
 
-GUIDES = frozenset({"albedo", "normal"})
+FEATURES = frozenset({"albedo", "normal"})
 FIXED = ("current", "albedo", "normal", "reference")
-HISTORY = ("color", "length", FEATURES)
+HISTORY = ("color", "length")
 # The last bits of a half float that are dropped.
 DROPPED = 4
 # Height and width of a tile; all images are cut into tiles, so that they fit into one tensor.
@@ -63,7 +62,7 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
     """Write a part."""
     fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
     for shard in shards:
-        handed = front.of(shard.shapes), GUIDES, shard.references, path.parent
+        handed = front.of(shard.shapes), FEATURES, shard.references, path.parent
         shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)[0]]
         about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(shots)}
         for place in tiles(shard.size):

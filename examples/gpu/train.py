@@ -36,7 +36,6 @@ from mcdenoise.metrics import psnr_srgb, smape_linear
 from mcdenoise.models import describe_weights, save_weights
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._weights import find_weights
-from mcdenoise.models.accumulated import FEATURES
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -74,7 +73,7 @@ class Tiles:
 
     def __post_init__(self) -> None:
         self.fixed = torch.empty(0, sum(CHANNELS.values()), *TILE, dtype=torch.float16, device=self.device)
-        self.history = torch.empty(0, 10, *TILE, dtype=torch.float16, device=self.device)
+        self.history = torch.empty(0, 4, *TILE, dtype=torch.float16, device=self.device)
         self.update()
         if not self.takes:
             raise InputError(f"{self.folder}: expected parts that pack.py has written, found none")
@@ -134,9 +133,8 @@ class Tiles:
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
     """Frames from their channels, and the reference."""
     current, albedo, normal, reference = fixed.split(list(CHANNELS.values()), 1)
-    color, length, features = history.split([3, 1, 6], 1)
-    given = {"current": current, "length": length, "albedo": albedo, "normal": normal}
-    return Frame(color=color, **given, extra={FEATURES: features}), reference
+    frame = Frame(color=history[:, :3], current=current, length=history[:, 3:], albedo=albedo, normal=normal)
+    return frame, reference
 
 
 def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Frame, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from mcdenoise.models._motion import comparable, is_still, motion_unless_still, 
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.ops import Surface, accumulate
+from mcdenoise.ops import Surface
 from mcdenoise.ops._steps.history import (
     COLOR,
     MEAN,
@@ -47,9 +47,6 @@ _STEADY = 0.1
 _NO_WAY = "no motion, and no position with a previous camera"
 
 
-# The buffer of ``extra`` that holds accumulated features.
-FEATURES = "accumulated_features"
-
 _Carried: TypeAlias = tuple[Tensor | None, ...]
 
 
@@ -70,7 +67,6 @@ class History(NamedTuple):
             are no compressed radiance; ``None`` for a buffer that the frame lacked.
         light: ``(B, 1, H, W)`` how much light lasts, see :func:`mcdenoise.models._fireflies.believed`; ``None`` where
             no fireflies are clamped.
-        features: ``(B, 6, H, W)`` albedo and normal; ``None`` where they are not accumulated.
     """
 
     color: Tensor
@@ -80,7 +76,6 @@ class History(NamedTuple):
     limit: Tensor
     carried: _Carried = ()
     light: Tensor | None = None
-    features: Tensor | None = None
 
 
 class _Blended(NamedTuple):
@@ -99,7 +94,6 @@ class _Blended(NamedTuple):
         reset: why there is no history; empty if there is one.
         found: fraction of the pixels that have a history.
         cut: whether there is a cut, where that is known on the device only.
-        features: as in :class:`History`.
     """
 
     color: Tensor
@@ -114,7 +108,6 @@ class _Blended(NamedTuple):
     reset: str
     found: Tensor | None = None
     cut: Tensor | None = None
-    features: Tensor | None = None
 
     @property
     def note(self) -> Note:
@@ -130,8 +123,7 @@ class _Blended(NamedTuple):
         if label is not None and not (at_hand(label.device) and not label.any()):
             label = label * _steady(self.color)
         surface = Surface(frame.position, frame.normal, frame.depth, label)
-        kept = (self.color, self.length, surface, frame.view_projection, self.next_limit, self.carried, light)
-        return History(*kept, self.features)
+        return History(self.color, self.length, surface, frame.view_projection, self.next_limit, self.carried, light)
 
 
 class Accumulated(Wrapper):
@@ -179,9 +171,6 @@ class Accumulated(Wrapper):
         also: names of further buffers to accumulate with the weights of the color, where a frame has them: buffers
             ``(B, 3, H, W)`` of ``frame.extra``, whose fireflies are kept; or ``"diffuse"`` and ``"specular"``, which
             the method sees accumulated.
-        features: whether the method also sees albedo and normal with less noise, as the buffer
-            ``accumulated_features`` of ``frame.extra``, ``(B, 6, H, W)``: the mean over the history, with the weights
-            of :func:`mcdenoise.ops.accumulate`. A missing albedo counts as one, a missing normal as zero.
 
     Raises:
         InputError: a setting is out of its range.
@@ -189,7 +178,7 @@ class Accumulated(Wrapper):
 
     stage, whole = "accumulate", True
     takes = MOTION | GUIDES | {"view_projection"}
-    gives = frozenset({"current", "length", FEATURES})
+    gives = frozenset({"current", "length"})
 
     def __init__(
         self,
@@ -203,7 +192,6 @@ class Accumulated(Wrapper):
         specular_length: float = SPECULAR_LENGTH,
         lag_threshold: float = THRESHOLD,
         also: Sequence[str] = (),
-        features: bool = False,
     ) -> None:
         super().__init__(inner)
         if not 0 < alpha_min <= 1:
@@ -213,7 +201,7 @@ class Accumulated(Wrapper):
         self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
         self.position_limit, self.normal_limit = position_limit, normal_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
-        self.also, self.features = tuple(also), features
+        self.also = tuple(also)
 
     # An attribute would be a setting for the training, which makes the wrappers at a model's outside anew.
     @property
@@ -245,13 +233,7 @@ class Accumulated(Wrapper):
         notes = [*self._notes(frame, still=still, keeps=keeps), found.note]
         after = found.history(frame, light) if keeps else None
         # Statistics of the noisy image are not passed on.
-        made: dict[str, Any] = {
-            "color": found.color[:, COLOR],
-            "current": found.entering[:, COLOR],
-            "length": found.length,
-        }
-        if found.features is not None:
-            made["extra"] = {**frame.extra, FEATURES: found.features}
+        made = {"color": found.color[:, COLOR], "current": found.entering[:, COLOR], "length": found.length}
         given = frame.replace(**made, statistics={}, hints=frame.hints._replace(still=still))
         given = self._with_carried(given, found.carried)
         del frame, found, made
@@ -296,8 +278,7 @@ class Accumulated(Wrapper):
                 limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
             return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
-        features = self._blend_features(frame, history, motion)
-        made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found, None, features)
+        made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found)
         if not blind:
             return made
         carried = tuple(
@@ -305,23 +286,14 @@ class Accumulated(Wrapper):
             for part, old in zip(self._first(frame, entering), carried, strict=True)
         )
         color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
-        if features is not None:
-            features = torch.where(cut, features_of(frame).to(entering.dtype), features)
         return made._replace(
-            color=color,
-            length=length,
-            carried=carried,
-            next_limit=torch.where(cut, 0, limit),
-            cut=cut,
-            features=features,
+            color=color, length=length, carried=carried, next_limit=torch.where(cut, 0, limit), cut=cut
         )
 
     def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
         """A frame without a history."""
         color, length = without_history(entering), torch.ones_like(entering[:, :1])
-        carried, features = self._first(frame, entering), features_of(frame).to(color.dtype) if self.features else None
-        begun = _Blended(color, length, carried, entering, limit, limit, seen, None, False, reset)
-        return begun._replace(features=features)
+        return _Blended(color, length, self._first(frame, entering), entering, limit, limit, seen, None, False, reset)
 
     def _lasting(self, frame: Frame, history: History | None, found: _Blended) -> tuple[Tensor | None, Output | None]:
         """How much light lasts, for the next frame; and what of this frame passes the method, ``None`` for nothing."""
@@ -370,23 +342,6 @@ class Accumulated(Wrapper):
             blended.append(torch.cat([color[:, COLOR], recent], 1) if decisive.shape[1] else color)
         return tuple(blended)
 
-    def _blend_features(self, frame: Frame, history: History, motion: Tensor | None) -> Tensor | None:
-        """Albedo and normal of a frame with their history, which no change of light shortens."""
-        if history.features is None:
-            return None
-        features, (surface, previous) = features_of(frame).to(history.features.dtype), self._surfaces(frame, history)
-        limits = {"position_limit": self.position_limit, "normal_limit": self.normal_limit}
-        return accumulate(
-            *(features, history.features, history.length, motion, surface, previous),
-            alpha_min=self.alpha_min,
-            rule=self.rule,
-            **limits,
-        )[0]
-
-    def _surfaces(self, frame: Frame, history: History) -> tuple[Surface, Surface]:
-        surfaces = surface_before(frame), history.surface
-        return comparable(*surfaces) if self.rule == "relative" else surfaces
-
     def _blend(
         self,
         frame: Frame,
@@ -397,9 +352,11 @@ class Accumulated(Wrapper):
         motion: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Color and length of the frame with its history, and how many pixels of each image have one."""
-        surface, previous = self._surfaces(frame, history)
+        surface, previous = surface_before(frame)._replace(label=seen), history.surface
+        if self.rule == "relative":
+            surface, previous = comparable(surface, previous)
         return blend(
-            *(entering, before, history.length, motion, surface._replace(label=seen), previous),
+            *(entering, before, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
             rule=self.rule,
             position_limit=self.position_limit,
@@ -447,8 +404,6 @@ class Accumulated(Wrapper):
                 f"state: expected what accumulated keeps of {now} images beside the color, found it of {before}: of "
                 f"another method or other layers; {ADVICE}"
             )
-        if (history.features is not None) != self.features:
-            raise InputError(f"state: expected one of the same settings; {ADVICE}")
         there = [frame.buffer(name) is not None for name in self.also]
         same = there == [part is not None for part in history.carried[now - len(there) :]]
         return "" if same else "other buffers than in the frame before"
@@ -470,13 +425,6 @@ class Accumulated(Wrapper):
             Note("reproject", why or source, float(why != "")),
             Note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps)),
         ]
-
-
-def features_of(frame: Frame) -> Tensor:
-    """Albedo and normal, ``(B, 6, H, W)``; one and zero where they are missing."""
-    albedo = torch.ones_like(frame.color) if frame.albedo is None else frame.albedo
-    normal = torch.zeros_like(frame.color) if frame.normal is None else frame.normal
-    return torch.cat([albedo, normal], 1)
 
 
 def _misfit(history: History, frame: Frame) -> str:

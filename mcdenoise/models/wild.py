@@ -21,7 +21,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_family
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
-from mcdenoise.models.accumulated import FEATURES, Accumulated, features_of
+from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
@@ -33,8 +33,8 @@ from mcdenoise.ops._window import corner, up_to_multiple
 from mcdenoise.ops.lag import THRESHOLD
 
 # The mean of frame and history, albedo, normal as the library sees them; the frame, the accumulated radiance; the part
-# of the history; albedo and normal of the frame.
-_CHANNELS = 9 + 3 + 3 + 1 + 6
+# of the history.
+_CHANNELS = 9 + 3 + 3 + 1
 # Initial logits of the network's image, of the frame, of the accumulated radiance, and of the mean.
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -12.0  # that of the network's image, while its weights are random
@@ -122,7 +122,7 @@ class WildNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.weight[3:].div_(_PACE)
             last.bias.zero_()[3].fill_(_LITTLE / _PACE)
-        uses, unet = frozenset({"current", "length", "albedo", "normal", FEATURES}), self.unet
+        uses, unet = frozenset({"current", "length", "albedo", "normal"}), self.unet
         self.needs = Needs(uses=uses, reach=unet.reach + Trust.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -140,9 +140,7 @@ class WildNetwork(nn.Module):
             part = (1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
             shown = (compress(image * exposure) for image in (alone, history))
             mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
-        features = frame.extra[FEATURES] if FEATURES in frame.extra else features_of(frame)
-        guides = (features.to(color.dtype), albedo, frame.normal)
-        seen, images = wild_input(mean, alone, history, *guides, part, exposure, self.needs.stride)
+        seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
         image, logits = corner(self.unet(seen), *frame.size).split([3, len(_LOGITS)], 1)
         predicted = torch.cat([image, _PACE * logits], 1)
         image = wild_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
@@ -174,8 +172,7 @@ def _wild(
     model = Skipping(Tiled(WildNetwork(size)), tolerance, alpha_min)
     threshold = THRESHOLD if anti_lag else math.inf
     # Clamped fireflies are light that the network would have to guess: stills had a tenth more error.
-    settings = {"alpha_min": alpha_min, "firefly_limit": math.inf, "lag_threshold": threshold}
-    return Demodulated(Accumulated(model, **settings, features=True))
+    return Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
 
 
 register_family(

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
-from mcdenoise.models.accumulated import FEATURES
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 from mcdenoise.ops import remodulate
 
@@ -47,8 +46,6 @@ class Front:
     def parts(self) -> dict[str, int]:
         """Names and channels of the buffers that depend on the noise seed: radiance, and histories."""
         accumulated = ACCUMULATED if self.accumulates else {"color": 3}
-        if any(settings.get("features") for _, settings in self.wrappers):
-            accumulated = {**accumulated, FEATURES: 6}
         return {**accumulated, **dict.fromkeys(self.given, 3), **(GIVEN if self._has(WithOidn) else {})}
 
     def of(self, buffers: Collection[str]) -> Front:

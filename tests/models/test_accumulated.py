@@ -17,7 +17,7 @@ from mcdenoise.data import open_sequence
 from mcdenoise.frame import Frame, Hints
 from mcdenoise.models import Accumulated
 from mcdenoise.models._motion import is_still
-from mcdenoise.models.accumulated import FEATURES, History
+from mcdenoise.models.accumulated import History
 from mcdenoise.ops import accumulate, demodulate, remodulate
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops.temporal import Rule
@@ -68,21 +68,6 @@ def test_images_that_are_accumulated_as_well_have_the_weights_of_the_color() -> 
         torch.testing.assert_close(seen.extra["sun"], 3 * seen.color)
         assert torch.equal(seen.extra["other"], frame.color)
     assert not torch.equal(seen.color, frame.color)
-
-
-def test_features_are_averaged_over_the_history_where_asked_for() -> None:
-    """With the weights of the color; a missing normal counts as zero, and a cut ends this history too."""
-    history, albedos = Shot(alpha_min=0.1, features=True), torch.rand(4, 1, 3, HEIGHT, WIDTH)
-    for i, albedo in enumerate(albedos, start=1):
-        # Another light every time: a change of it shortens the history of the radiance only.
-        history.update(still(100.0**i * torch.rand(1, 3, HEIGHT, WIDTH), albedo=albedo))
-        seen = history.watching.frames[-1]
-        assert torch.equal(seen.albedo, albedo)
-        torch.testing.assert_close(seen.extra[FEATURES][:, :3], albedos[:i].mean(0))
-        assert not seen.extra[FEATURES][:, 3:].any()
-    history.reset()
-    history.update(still(torch.rand(1, 3, HEIGHT, WIDTH), albedo=albedos[0]))
-    assert torch.equal(history.watching.frames[-1].extra[FEATURES][:, :3], albedos[0])
 
 
 def test_a_cut_resets() -> None:

@@ -48,8 +48,8 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
         # From the dark, where the scale is linear, to the largest radiance and beyond.
         (transfer.compress, [layout((6 * draw(15, batch, 3, height, width, dtype)).exp())]),
         (transfer.expand, [layout(draw(16, batch, 3, height, width, dtype).sigmoid())]),
-        (wild.wild_input, [*radiance, some(8, 6), *seen, part, exposure, 4]),
-        (wild.wild_input, [*radiance, some(8, 6), None, None, part, exposure, 1]),
+        (wild.wild_input, [*radiance, *seen, part, exposure, 4]),
+        (wild.wild_input, [*radiance, None, None, part, exposure, 1]),
         (wild.wild_choice, [predicted, on_scale, part, exposure, (0.0, -2.0, -1.0, 0.5)]),
     ]
     return calls

@@ -21,7 +21,6 @@ def wild_input(
     color: Tensor,
     alone: Tensor,
     history: Tensor,
-    features: Tensor,
     albedo: Tensor | None,
     normal: Tensor | None,
     part: Tensor,
@@ -33,12 +32,12 @@ def wild_input(
     # A single number that is read for every pixel.
     albedo = color.new_ones(1, 1, 1, 1).expand_as(color) if albedo is None else albedo
     normal = color.new_zeros(1, 1, 1, 1).expand_as(color) if normal is None else normal
-    buffers = (color, alone, history, features, albedo, normal, part, exposure.expand(len(color), 1, 1, 1))
+    buffers = (color, alone, history, albedo, normal, part, exposure.expand(len(color), 1, 1, 1))
     if dtype == torch.float16 or not _are_alike(*buffers):
         return NotImplemented
     batch, _, height, width = color.shape
     rows, columns = (-(-side // multiple) * multiple for side in (height, width))
-    seen = torch.empty((batch, 22, rows, columns), dtype=dtype, memory_format=torch.channels_last, device="cpu")
+    seen = torch.empty((batch, 16, rows, columns), dtype=dtype, memory_format=torch.channels_last, device="cpu")
     seen[..., height:, :], seen[..., width:] = 0, 0
     images = torch.empty((batch, 9, height, width), dtype=color.dtype, device="cpu")
     if images.numel():
@@ -73,7 +72,6 @@ def _input_rows(
     color: Any,
     alone: Any,
     history: Any,
-    features: Any,
     albedo: Any,
     normal: Any,
     part: Any,
@@ -100,16 +98,14 @@ def _input_rows(
                 _round_row(rows[c], images[b, c, y, x0 : x0 + n])
                 _round_row(rows[9 + c], images[b, 3 + c, y, x0 : x0 + n])
                 _round_row(rows[12 + c], images[b, 6 + c, y, x0 : x0 + n])
-                for image, channel, to in ((features, c, 3 + c), (albedo, c, 16 + c)):
-                    read_row(values, image, b, channel, y, x0)
-                    for x in range(n):
-                        values[x] = min(max(values[x], zero), one)
-                    _round_row(rows[to], values)
-                for image, channel, to in ((features, 3 + c, 6 + c), (normal, c, 19 + c)):
-                    read_row(values, image, b, channel, y, x0)
-                    for x in range(n):
-                        values[x] = min(max(values[x], -one), one) * half + half
-                    _round_row(rows[to], values)
+                read_row(values, albedo, b, c, y, x0)
+                for x in range(n):
+                    values[x] = min(max(values[x], zero), one)
+                _round_row(rows[3 + c], values)
+                read_row(values, normal, b, c, y, x0)
+                for x in range(n):
+                    values[x] = min(max(values[x], -one), one) * half + half
+                _round_row(rows[6 + c], values)
             read_row(values, part, b, 0, y, x0)
             _round_row(rows[15], values)
             start = b * strides[0] + y * strides[2] + x0 * strides[3]

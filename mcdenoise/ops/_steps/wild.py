@@ -18,7 +18,6 @@ def wild_input(
     color: Tensor,
     alone: Tensor,
     history: Tensor,
-    features: Tensor,
     albedo: Tensor | None,
     normal: Tensor | None,
     part: Tensor,
@@ -31,7 +30,6 @@ def wild_input(
         color: ``(B, 3, H, W)`` radiance, a mean of the frame and its history.
         alone: ``(B, 3, H, W)`` radiance of the frame.
         history: ``(B, 3, H, W)`` accumulated radiance.
-        features: ``(B, 6, H, W)`` accumulated albedo and normal, are clamped as those of the frame.
         albedo: ``(B, 3, H, W)``, is clamped to [0, 1]; ``None`` counts as one.
         normal: ``(B, 3, H, W)``, is clamped to [-1, 1]; ``None`` counts as zero.
         part: ``(B, 1, H, W)`` part of the history in the accumulated radiance.
@@ -39,16 +37,15 @@ def wild_input(
         multiple: height and width of the input are padded with zeros to multiples of this.
 
     Returns:
-        ``(B, 22, H', W')`` the mean on the scale, accumulated albedo, accumulated normal in [0, 1], the frame and the
-        accumulated radiance on the scale, part, the frame's albedo and normal; and ``(B, 9, H, W)`` the three images of radiance on the scale. The fast backend writes the
+        ``(B, 16, H', W')`` the mean on the scale, albedo, normal in [0, 1], the frame and the accumulated radiance on
+        the scale, part; and ``(B, 9, H, W)`` the three images of radiance on the scale. The fast backend writes the
         input as a convolution takes it: channels-last, in the precision of autocast.
     """
     images = compress(torch.cat([color, alone, history], 1) * exposure)
     albedo = torch.ones_like(color) if albedo is None else albedo
     normal = torch.zeros_like(color) if normal is None else normal
     mean, others = images.split([3, 6], 1)
-    steady, own = seen_by_oidn(mean, features[:, :3], features[:, 3:]), seen_by_oidn(part, albedo, normal)
-    seen = torch.cat([steady, others, own], 1)
+    seen = torch.cat([seen_by_oidn(mean, albedo, normal), others, part], 1)
     return up_to_multiple(seen, multiple), images
 
 
