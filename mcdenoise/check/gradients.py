@@ -164,20 +164,12 @@ def _of_differentiable(op: Op, case: Case) -> tuple[Function, tuple[Tensor, ...]
     fixed = case.inputs()
     chosen: Inputs = {name: fixed[name] for name in case.differentiable}
 
-    def results(*tensors: Tensor) -> tuple[Tensor, ...]:
+    def function(*tensors: Tensor) -> tuple[Tensor, ...]:
         remaining = iter(tensors)
         given = map_tensors(lambda _: next(remaining), chosen)
-        return as_tuple(op.function(**(fixed | given), **case.settings))
+        return tuple(map(_finite, as_tuple(op.function(**(fixed | given), **case.settings))))
 
-    arguments = tuple(tensor.requires_grad_() for tensor in tensors_in(chosen))
-    # torch takes one result for another where one without a derivative comes before it.
-    smooth = [result.requires_grad for result in results(*arguments)]
-
-    def function(*tensors: Tensor) -> tuple[Tensor, ...]:
-        found = results(*tensors)
-        return tuple(_finite(result) for result, kept in zip(found, smooth, strict=True) if kept or not any(smooth))
-
-    return function, arguments
+    return function, tuple(tensor.requires_grad_() for tensor in tensors_in(chosen))
 
 
 def _finite(result: Tensor) -> Tensor:

@@ -30,14 +30,6 @@ def lights(root: Tensor) -> Tensor:
     return found
 
 
-def blend(
-    entering: Tensor,
-    previous: Tensor,
-    previous_length: Tensor,
-    motion: Tensor,
-    features: Tensor,
-    previous_features: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def blend(entering: Tensor, previous: Tensor, previous_length: Tensor, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     color, length = history.accumulate(entering, previous, previous_length, motion)
-    steady, _ = history.accumulate(features, previous_features, previous_length, motion)
-    return color, length, (length > 1).double().mean((1, 2, 3)), steady
+    return color, length, (length > 1).double().mean((1, 2, 3))
