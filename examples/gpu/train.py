@@ -31,11 +31,9 @@ from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.frame import Frame
-from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear
-from mcdenoise.models import describe_weights, save_weights
+from mcdenoise.models import save_weights
 from mcdenoise.models._precision import fastest_precision
-from mcdenoise.models._weights import find_weights
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
@@ -234,10 +232,6 @@ class Run:
         torch.manual_seed(config.seed)
         random.seed(config.seed)
         self.network, self.settings, self.start = begun(config)
-        first = parse_method(config.start_from or config.model)
-        shipped = (first.weights or find_weights(first.model)) if config.start_from else None
-        # The authors of the scenes that these were trained on are owed credit, too.
-        self.earlier = json.loads(describe_weights(shipped)["data"]) if shipped else []
         self.network.to(self.device, memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).requires_grad_(False)
         weights = dict(self.network.named_parameters())
@@ -293,8 +287,8 @@ class Run:
         """Write the averaged weights."""
         commits = [{"first_step": 0, "commit": source_commit()}]
         config = asdict(replace(self.config, steps=self.steps))
-        identity = identity | {"initial_weights": self.start, "sequences": [*self.earlier, *identity["sequences"]]}
-        about = about_weights(config, identity, self.steps, commits)
+        identity = identity | {"initial_weights": self.start["sha256"]}
+        about = about_weights(config, identity, self.steps, commits, self.start["data"])
         with atomic_path(path) as temporary:
             temporary.write_bytes(save_weights(self.average, self.config.model, self.settings, about))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import threading
 import time
@@ -23,6 +24,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Model, State, create_model, describe_weights, save_weights, start_with
 from mcdenoise.models._defaults import plain_defaults
+from mcdenoise.models._weights import find_weights
 from mcdenoise.train.cache import writing
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
@@ -114,7 +116,7 @@ def train(
     run.check(config=settled)
     with fabric.rank_zero_first():
         data = TrainingData.load(config, front, rest.needs, sequences, validation or [], cache or out / "cache")
-    identity = {"credits": credits, "initial_weights": start, **data.description}
+    identity = {"credits": credits, "initial_weights": start["sha256"], **data.description}
     identity |= {"recipe": recipe} if recipe else {}
     first_clip = data.sampler.draw([config.seed])
     network.eval()
@@ -135,19 +137,24 @@ def train(
     with writing(out), held(out, "training") if fabric.is_global_zero else nullcontext():
         _run(trainer, data, run, first, provenance, checkpoint_every, report)
         if fabric.is_global_zero:
-            about = about_weights(settled, identity, config.steps, provenance)
+            about = about_weights(settled, identity, config.steps, provenance, start["data"])
             with atomic_path(weights) as temporary:
                 temporary.write_bytes(save_weights(trainer.result, config.model, settings, about))
     fabric.barrier()
     return weights
 
 
-def begun(config: TrainConfig) -> tuple[Any, dict[str, Any], str]:
-    """The model in training mode, its settings, and the checksum of the weights that it begins with."""
+def begun(config: TrainConfig) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """The model in training mode, its settings, and ``sha256`` and ``data`` of the weights that it begins with."""
     first = parse_method(config.start_from) if config.start_from else None
     weights = None if first is None else first.weights
-    start: dict[str, Any] = describe_weights(weights) if weights else {"settings": {}, "sha256": "none"}
-    settings: dict[str, Any] = {**start["settings"], **config.model_settings}
+    file = None if first is None else weights or find_weights(first.model)
+    about = describe_weights(file) if file else {}
+    try:
+        start = {"sha256": about["sha256"] if weights else "none", "data": list(json.loads(about.get("data", "[]")))}
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: header 'data': expected a JSON array, found other text") from error
+    settings: dict[str, Any] = {**(about["settings"] if weights else {}), **config.model_settings}
     # Typed as both model and module.
     model: Any = create_model(config.model, weights=weights, **settings)
     if not isinstance(model, nn.Module) or not any(weight.requires_grad for weight in model.parameters()):
@@ -155,7 +162,7 @@ def begun(config: TrainConfig) -> tuple[Any, dict[str, Any], str]:
     network: Any = model.train()
     if first is not None and weights is None:
         start["sha256"] = start_with(network, first.model, **first.settings)
-    return network, settings, start["sha256"]
+    return network, settings, start
 
 
 def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> bool:

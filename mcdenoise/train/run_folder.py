@@ -8,6 +8,7 @@ import json
 import math
 import os
 import reprlib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -192,7 +193,7 @@ def _difference(path: Path, content: Any) -> str:
 
 
 def about_weights(
-    config: dict[str, Any], identity: dict[str, Any], steps: int, provenance: Provenance
+    config: dict[str, Any], identity: dict[str, Any], steps: int, provenance: Provenance, earlier: Sequence[Any] = ()
 ) -> dict[str, str]:
     """Provenance of weights from a training run, for :func:`mcdenoise.models.save_weights`.
 
@@ -201,10 +202,11 @@ def about_weights(
         identity: contents of ``data.json``.
         steps: number of finished optimiser steps.
         provenance: the commits that computed the steps.
+        earlier: data that the first weights were trained on, whose authors are owed credit, too.
     """
     return {
         "config": json.dumps(config),
-        "data": json.dumps(identity["sequences"]),
+        "data": json.dumps([*earlier, *identity["sequences"]]),
         "credits": identity["credits"],
         **({"recipe": identity["recipe"]} if "recipe" in identity else {}),
         "initial_weights": identity["initial_weights"],

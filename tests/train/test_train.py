@@ -448,4 +448,6 @@ def test_a_run_can_start_from_weights(shared_sequence: Path, finished: Path, tmp
         torch.testing.assert_close(after[key], tensor, rtol=1e-3, atol=1e-6)
     about = describe_weights(second)
     assert about["initial_weights"] == describe_weights(first)["sha256"]
+    # The authors of the data of both are owed credit.
+    assert json.loads(about["data"]) == 2 * json.loads(describe_weights(first)["data"])
     assert about["settings"] == create_settings(width=4)
