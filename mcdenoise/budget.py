@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import functools
 import platform
 import statistics
 from collections.abc import Callable
@@ -19,9 +19,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models._precision import PRECISIONS, Precision
 from mcdenoise.models._weights import pretrained_models
-from mcdenoise.reading import read_text
 from mcdenoise.results import Results
-from mcdenoise.user_cache import cache_file, keep
+from mcdenoise.user_cache import measured_once
 
 _ROUNDS = 3
 _TRIED = "only models with weights of this package are tried, so that oidn_temporal needs --model"
@@ -63,7 +62,6 @@ def choose_model(
     max_error: float | None = None,
     results: Path | None = None,
     device: str = "cpu",
-    cache: Path | None = None,
     on_step: Callable[[int, int], None] = lambda done, total: None,
 ) -> Choice:
     """Choose the fastest shipped model and precision with an error of at most ``max_error``, if that is given.
@@ -78,7 +76,6 @@ def choose_model(
         results: folder of a finished benchmark, whose errors (mean over its scenes) are used; without it errors are
             measured on the last frames of the sequence that have a reference.
         device: device to run on.
-        cache: file of earlier run times; by default ``run_times.json`` in the user's cache folder.
         on_step: called with the number of measured models and the number of all models.
 
     Raises:
@@ -91,7 +88,7 @@ def choose_model(
         raise InputError(
             f"--max-error: expected references in {sequence.root}, or --results of a finished benchmark, found neither"
         )
-    choices = _timed(sequence.size, device, cache_file("run_times.json") if cache is None else cache, on_step)
+    choices = _timed(sequence.size, device, on_step)
     affordable = [choice for choice in choices if budget is None or choice.milliseconds <= budget]
     if not affordable:
         raise InputError(
@@ -116,30 +113,19 @@ def choose_model(
     )
 
 
-def _timed(size: tuple[int, int], device: str, cache: Path, on_step: Callable[[int, int], None]) -> list[Choice]:
+def _timed(size: tuple[int, int], device: str, on_step: Callable[[int, int], None]) -> list[Choice]:
     """All shipped models in all precisions, fastest first."""
     height, width = size
     machine = f"{platform.node()}, {platform.machine()}, {device}, {torch.get_num_threads()} threads"
-    key = f"{machine}, mcdenoise {version('mcdenoise')}, torch {torch.__version__}, {width}x{height}"
-    known = _read(cache)
-    own = known.setdefault(key, {})
+    place = f"{machine}, mcdenoise {version('mcdenoise')}, torch {torch.__version__}, {width}x{height}"
     choices = [Choice(model, precision, 0.0) for model in pretrained_models() for precision in PRECISIONS]
     measured = []
     for done, choice in enumerate(choices, start=1):
-        if choice.name not in own:
-            own[choice.name] = _measure(choice, size, device)
-        measured.append(replace(choice, milliseconds=own[choice.name]))
+        measure = functools.partial(_measure, choice, size, device)
+        milliseconds = measured_once("run_times.json", f"{place}, {choice.name}", measure)
+        measured.append(replace(choice, milliseconds=milliseconds))
         on_step(done, len(choices))
-    keep(cache, json.dumps(known, indent=1) + "\n")
     return sorted(measured, key=lambda choice: choice.milliseconds)
-
-
-def _read(cache: Path) -> dict[str, dict[str, float]]:
-    try:
-        known = json.loads(read_text(cache))
-        return {key: {name: float(value) for name, value in own.items()} for key, own in known.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError, OverflowError):
-        return {}
 
 
 def _measure(choice: Choice, size: tuple[int, int], device: str) -> float:

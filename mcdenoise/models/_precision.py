@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
 import platform
 import statistics
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import torch
@@ -21,8 +18,7 @@ from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.nn.oidn import OidnUNet
-from mcdenoise.reading import read_text
-from mcdenoise.user_cache import cache_file, keep
+from mcdenoise.user_cache import measured_once
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
@@ -60,12 +56,7 @@ def fastest_precision(device: torch.device) -> Chosen:
         raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(PRECISIONS)}, found '{own}'")
     if not _has_bfloat16(device):
         return Chosen("float32", "the processor has no bfloat16")
-    cache, key = cache_file("precision.json"), _machine(device)
-    ratios = _read(cache)
-    ratio = ratios.get(key, 0.0)
-    if not (math.isfinite(ratio) and ratio > 0):
-        ratio = _measured(device)
-        keep(cache, json.dumps({**ratios, key: ratio}, indent=1) + "\n")
+    ratio = measured_once("precision.json", _machine(device), lambda: _measured(device))
     precision: Precision = "bfloat16" if ratio >= _WORTH else "float32"
     return Chosen(precision, f"a convolution in bfloat16 takes {1 / ratio:.2f} of the time in float32 here")
 
@@ -135,10 +126,3 @@ def _machine(device: torch.device) -> str:
         told = [os.environ[limit] for limit in ("ONEDNN_MAX_CPU_ISA", "DNNL_MAX_CPU_ISA") if limit in os.environ]
         name = " ".join([platform.machine(), str(known.get("cpu_name", "")), *units, *told])
     return f"{name}, torch {torch.__version__}, one thread"
-
-
-def _read(cache: Path) -> dict[str, float]:
-    try:
-        return {key: float(value) for key, value in json.loads(read_text(cache)).items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        return {}

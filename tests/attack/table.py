@@ -232,8 +232,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "weights": of("models", "load_weights", lambda model: model.state_dict()),
     "results": Results.read,
     "run": read_run,
-    "run_times": of("budget", "_read"),
-    "precision": of("models._precision", "_read"),
+    "run_times": of("user_cache", "numbers_in"),
+    "precision": of("user_cache", "numbers_in"),
     "clean": lambda path: read_clean_features(path, 0),
     "halves": read_halves,
     "take": of(

@@ -95,7 +95,7 @@ def build(folder: Path) -> None:
     (folder / "path.json").write_text(json.dumps({"fov": 40, "frames": poses}, indent=1))
     (folder / "results").mkdir()
     results().write(folder / "results")
-    (folder / "run_times.json").write_text(json.dumps({"a machine": {MODEL: 12.5}}))
+    (folder / "run_times.json").write_text(json.dumps({"a machine": 12.5}))
     (folder / "precision.json").write_text(json.dumps({"a machine": 1.5}))
     (folder / "clean").mkdir()
     write_clean_features(folder / "clean", 0, *(tensor(np.ones((WIDTH * HEIGHT, 3))),) * 2)
