@@ -64,12 +64,13 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def held(folder: Path, work: str) -> Iterator[None]:
+def held(folder: Path, work: str, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder for this process; the lock is released when the process ends in any way.
 
     Args:
-        folder: folder that gets the lock file; that of a killed process is taken over.
+        folder: folder that gets the lock file; that of a killed process is taken over. Created if it does not exist.
         work: the kind of work, one word, for the message.
+        wait: whether to wait for a process that holds the lock.
 
     Raises:
         InputError: another process holds the lock (the message names it), or the lock file cannot be written.
@@ -79,12 +80,13 @@ def held(folder: Path, work: str) -> Iterator[None]:
         >>> with held(Path(tempfile.mkdtemp()), "training"):
         ...     pass
     """
+    make_folder(folder)
     path = folder / ".lock"
     with ExitStack() as stack:
         while True:
-            with _writing(path):
+            with writing(path):
                 file = stack.enter_context(path.open("a+", encoding="utf-8"))
-            if fcntl is not None and not _lock(file.fileno()):
+            if fcntl is not None and not _lock(file.fileno(), wait=wait):
                 file.seek(0)
                 raise InputError(
                     f"{folder}: expected a folder that no other {work} writes to, found "
@@ -94,7 +96,7 @@ def held(folder: Path, work: str) -> Iterator[None]:
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                     break
-        with _writing(path):
+        with writing(path):
             file.truncate(0)
             file.write(f"process {os.getpid()} of {platform.node()} at work in it")
             file.flush()
@@ -124,7 +126,7 @@ def new_folder(path: Path) -> Iterator[Path]:
         InputError: ``path`` exists and is no empty folder, or the operating system refuses to write.
     """
     exists = path.is_dir()
-    with _writing(path):
+    with writing(path):
         if exists:
             _sweep(path)
         if os.listdir(path) if exists else os.path.lexists(path):
@@ -163,7 +165,7 @@ def _temporary(path: Path, temporary: Path, *, folder: bool = False) -> Iterator
     """Create and lock an incomplete file or folder for ``path``, and remove it unless it is renamed in the block."""
     handle = -1
     try:
-        with unfinished(temporary), _writing(path):
+        with unfinished(temporary), writing(path):
             _sweep(temporary.parent)
             if folder:
                 temporary.mkdir(parents=True)
@@ -248,16 +250,16 @@ def remove(path: Path) -> None:
     Raises:
         InputError: it is not a file, or the operating system refuses.
     """
-    with _writing(path):
+    with writing(path):
         path.unlink(missing_ok=True)
 
 
-def _lock(handle: int) -> bool:
+def _lock(handle: int, *, wait: bool = False) -> bool:
     """Lock an open file or folder until it is closed; return false if another process has locked it."""
     if fcntl is None:
         return False
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except OSError:
         # Already locked, or on a file system without locks.
         return False
@@ -315,8 +317,8 @@ def cannot_write(path: Path, reason: str) -> InputError:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Convert errors of the operating system to an ``InputError``."""
+def writing(path: Path) -> Iterator[None]:
+    """Convert errors of the operating system in the block to an ``InputError`` about a path."""
     try:
         yield
     except OSError as error:

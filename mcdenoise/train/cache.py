@@ -7,20 +7,18 @@ if they are damaged, the arrays are computed again.
 
 from __future__ import annotations
 
-import fcntl
 import functools
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import new_folder
+from mcdenoise.data.files import held, new_folder, writing
 from mcdenoise.errors import InputError
 from mcdenoise.train.shots import Array
 
@@ -48,7 +46,7 @@ def open_cache(sequence: Sequence, settings: list[Any], folder: Path) -> Keep:
 def _kept(folder: Path, key: str, name: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:
     place = folder / name
     if (found := _mapped(place, key)) is None:
-        with locked(folder):
+        with held(folder, "training", wait=True), writing(folder):
             # Another process may have done the work while this one waited.
             if (found := _mapped(place, key)) is None:
                 shutil.rmtree(place, ignore_errors=True)
@@ -62,30 +60,6 @@ def _kept(folder: Path, key: str, name: str, make: Callable[[], Mapping[str, Arr
     if found is None:
         raise InputError(f"{place}: expected the arrays just written, found them damaged; check the disk")
     return found
-
-
-@contextmanager
-def locked(place: Path) -> Iterator[None]:
-    """Create and lock a folder for this process; the lock is released when the process ends in any way.
-
-    Raises:
-        InputError: the operating system refuses to write, also in the block.
-    """
-    with writing(place):
-        place.mkdir(parents=True, exist_ok=True)
-        with (place / "lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
-
-
-@contextmanager
-def writing(place: Path) -> Iterator[None]:
-    """Convert errors of the operating system to an ``InputError``."""
-    try:
-        yield
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise InputError(f"{place}: cannot be written ({reason}); check its permissions and free space") from error
 
 
 def _mapped(place: Path, key: str) -> dict[str, Array] | None:

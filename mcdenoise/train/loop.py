@@ -19,13 +19,12 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from mcdenoise.commit import source_commit
-from mcdenoise.data.files import atomic_path, held
+from mcdenoise.data.files import atomic_path, held, writing
 from mcdenoise.errors import InputError
 from mcdenoise.methods import parse_method
 from mcdenoise.models import Model, State, create_model, describe_weights, save_weights, start_with
 from mcdenoise.models._defaults import plain_defaults
 from mcdenoise.models._weights import find_weights
-from mcdenoise.train.cache import writing
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.config import TrainConfig, check_config
 from mcdenoise.train.data import TrainingData

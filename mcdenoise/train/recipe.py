@@ -29,13 +29,12 @@ from typing import Annotated, Any, Literal, get_type_hints
 import msgspec
 from msgspec import UNSET, Meta
 
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import held, write_text, writing
 from mcdenoise.data.shards import find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.methods import check_names_no_code
 from mcdenoise.models import create_model
 from mcdenoise.reading import read_text
-from mcdenoise.train.cache import locked
 from mcdenoise.train.config import TrainConfig, check_config, told
 from mcdenoise.train.references import clean_references
 
@@ -96,7 +95,7 @@ class Rendering:
         """
         place = self.folder(data)
         finished = place / "finished.json"
-        with locked(place):
+        with held(place, "rendering", wait=True), writing(place):
             if not finished.exists():
                 generate()
                 write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")

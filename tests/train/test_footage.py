@@ -84,8 +84,8 @@ def pixels(shots: list[Shot]) -> torch.Tensor:
 
 
 def entries(folder: Path) -> list[str]:
-    """Every file of a cache, without the locks."""
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+    """Every file of a cache."""
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
 def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> None:
