@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from difflib import get_close_matches
+from typing import Any
 
 # A channel name may have 255 bytes, and a path 4096.
 _LONGEST = 1500
@@ -24,6 +26,23 @@ class InputError(ValueError):
 
 class MissingBufferError(InputError):
     """A frame lacks a buffer that a method needs."""
+
+
+def import_optional(package: str, use: str, extra: str) -> Any:
+    """Import an optional package.
+
+    Args:
+        package: its name in Python.
+        use: what needs it, for the message.
+        extra: the extra of this package that installs it.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise InputError(f"{use} needs {package}, which is not installed; pip install 'mcdenoise[{extra}]'") from error
 
 
 def run_script(main: Callable[[], object]) -> None:

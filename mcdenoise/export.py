@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import warnings
 from collections.abc import Collection, Iterator, Mapping
@@ -19,7 +18,7 @@ from torch.utils import _pytree as pytree
 from mcdenoise.data import Sequence
 from mcdenoise.data.files import atomic_path
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import BUFFERS, Frame, Hints
 from mcdenoise.models import Model, State
 from mcdenoise.models._contract import check_needs
@@ -199,7 +198,8 @@ def export_model(
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: cannot be written: expected its folder to exist, found none")
     if path.suffix == ".onnx":
-        _check_packages("onnx", "onnxscript")
+        for package in ("onnx", "onnxscript"):
+            import_optional(package, "an export", "export")
     step = Step(model, default_buffers(model) if buffers is None else buffers)
     program = traced(step)
     inputs = (*step.given, *(f"state.{each}" for each in step.state))
@@ -228,12 +228,10 @@ def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterato
     Raises:
         InputError: onnxruntime is missing, or the frames lack a buffer.
     """
-    _check_packages("onnxruntime")
+    onnxruntime = import_optional("onnxruntime", "a comparison", "export")
     names = [name for name in exported.inputs if not name.startswith("state.")]
     if absent := [name for name in names if name not in sequence.buffers | {"depth"}]:
         raise InputError(f"{sequence.root}: expected the buffer '{absent[0]}', which the graph takes, found none")
-    import onnxruntime
-
     options = onnxruntime.SessionOptions()
     # Log errors only; warnings about constant folding do not matter here.
     options.log_severity_level = 3
@@ -321,12 +319,6 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(before)
-
-
-def _check_packages(*names: str) -> None:
-    for name in names:
-        if importlib.util.find_spec(name) is None:
-            raise InputError(f"{name}: expected it to be installed, found it missing; pip install 'mcdenoise[export]'")
 
 
 def _example(name: str, size: tuple[int, int], batch: int) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable
 from fractions import Fraction
 from itertools import chain
@@ -13,7 +12,7 @@ import numpy as np
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.png import Picture
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 
 # Longest side that hardware decoders support (level 5.1); larger pictures are scaled down.
 _LONGEST = 4096
@@ -36,11 +35,7 @@ def check_video(frames_per_second: float) -> None:
     slowest, fastest = _RATES
     if not slowest <= frames_per_second <= fastest:
         raise InputError(f"frames per second: expected {slowest:g} to {fastest:g}, found {frames_per_second:g}")
-    try:
-        package = importlib.import_module("av")
-    except ImportError as error:
-        raise InputError("a video needs av, which is not installed; pip install 'mcdenoise[preview]'") from error
-    if _CODEC not in package.codecs_available:
+    if _CODEC not in import_optional("av", "a video", "preview").codecs_available:
         raise InputError(f"a video: expected av with {_CODEC}, found it built without; install its wheel")
 
 

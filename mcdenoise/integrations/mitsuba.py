@@ -6,7 +6,6 @@ Dr.Jit and Mitsuba are optional (``pip install 'mcdenoise[render]'``) and import
 from __future__ import annotations
 
 import copy
-import importlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.denoiser import AskedPrecision, Denoiser
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.models import Model
 
@@ -104,7 +103,7 @@ class MitsubaDenoiser:
         precision: AskedPrecision = "auto",
         **settings: Any,
     ) -> None:
-        self._mi, self._dr = _import("mitsuba"), _import("drjit")
+        self._mi, self._dr = (import_optional(name, "MitsubaDenoiser", "render") for name in ("mitsuba", "drjit"))
         self._size = _size(input_size)
         self._declared = {"albedo": albedo, "normals": normals, "flow": temporal}
         self._temporal, self._denoise_alpha = temporal, denoise_alpha
@@ -323,10 +322,3 @@ def _size(input_size: Any) -> tuple[int, int]:
     if len(sizes) != 2 or any(int(each) != each or each < 1 for each in sizes):
         raise InputError(f"input_size: expected width and height in pixels, found {input_size}")
     return int(sizes[0]), int(sizes[1])
-
-
-def _import(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(f"{name} is needed, which is not installed; pip install 'mcdenoise[render]'") from error

@@ -5,7 +5,6 @@ https://www.openimagedenoise.org, Apache License 2.0; optional, ``pip install 'm
 
 from __future__ import annotations
 
-import importlib
 import math
 import weakref
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State
@@ -223,12 +222,7 @@ def check_choice(name: str, value: str, known: Any) -> None:
 
 
 def _import_oidn() -> Any:
-    try:
-        return importlib.import_module("pyoidn")
-    except ImportError as error:
-        raise InputError(
-            "Open Image Denoise needs pyoidn, which is not installed; pip install 'mcdenoise[oidn]'"
-        ) from error
+    return import_optional("pyoidn", "Open Image Denoise", "oidn")
 
 
 def library_of_oidn() -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.files import make_folder, write_text
-from mcdenoise.errors import InputError
+from mcdenoise.errors import import_optional
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, FORMATS, data_uri, decode
@@ -112,14 +111,7 @@ def check_packages() -> None:
         InputError: a package of ``mcdenoise[report]`` is not installed.
     """
     for package in ("jinja2", "matplotlib", "PIL"):
-        _check_package(package)
-
-
-def _check_package(name: str) -> None:
-    try:
-        importlib.import_module(name)
-    except ImportError as error:
-        raise InputError(f"a report needs {name}, which is not installed; pip install 'mcdenoise[report]'") from error
+        import_optional(package, "a report", "report")
 
 
 def render_page(template: str, content: dict[str, Any]) -> str:
@@ -132,9 +124,7 @@ def render_page(template: str, content: dict[str, Any]) -> str:
     Raises:
         InputError: a package of ``mcdenoise[report]`` is not installed.
     """
-    _check_package("jinja2")
-    import jinja2
-
+    jinja2 = import_optional("jinja2", "a report", "report")
     page = Path(__file__).parent / "page"
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(page),

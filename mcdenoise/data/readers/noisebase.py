@@ -29,7 +29,7 @@ from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.motion import miss
 
@@ -399,13 +399,7 @@ def _opened(path: Path, index: int | None = None) -> Iterator[_Arrays]:
     """Open a zip, and convert every error to one line."""
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a zip of Noisebase, found none; check the path")
-    try:
-        # Imported here because it is optional, and slow to load.
-        import zarr  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            "noisebase: expected the package zarr, found none; install it with pip install 'mcdenoise[noisebase]'"
-        ) from error
+    import_optional("zarr", "noisebase", "noisebase")
     try:
         with zipfile.ZipFile(path) as file:
             yield _Arrays(file, index)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib
 import os
 import subprocess
 import sys
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.scenes.assets import Mesh
 
 Scene: TypeAlias = str | Path | Mapping[str, Any]
@@ -110,12 +109,7 @@ def scene_digest(scene: Scene) -> str:
 
 def import_mitsuba() -> Any:
     """Its module, which looks for nothing in the working folder."""
-    try:
-        mitsuba = importlib.import_module("mitsuba")
-    except ImportError as error:
-        raise InputError(
-            "rendering needs Mitsuba 3, which is not installed; pip install 'mcdenoise[render]'"
-        ) from error
+    mitsuba = import_optional("mitsuba", "rendering", "render")
     places = mitsuba.file_resolver()
     for number in reversed(range(len(places))):
         # Mitsuba would load native code, plugins/NAME.so, from the working folder before its own.
