@@ -1,11 +1,14 @@
 """Planes, the simplest surfaces: their features are known at every point of a pixel."""
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from mcdenoise.data.camera_path import Camera
 from mcdenoise.frame import Frame
 
 HEIGHT, WIDTH = 40, 60
@@ -81,3 +84,20 @@ def synthetic(width: int, height: int, seed: int = 0) -> Frame:
         depth=torch.where(floor, 1 / rows.clamp_min(0.1), torch.inf),
         motion=torch.full((1, 2, height, width), 0.3),
     )
+
+
+class Rays(NamedTuple):
+    """Rays from an origin ``(3,)`` in unit directions ``(H*W, 3)``."""
+
+    origin: Any
+    directions: Any
+
+
+def pixel_rays(camera: Camera, width: int, height: int) -> Rays:
+    """The rays of a camera through the centres of pixels, row by row from the top left, in world space."""
+    tan = math.tan(math.radians(camera.fov_x) / 2)
+    # Camera x points left, camera y up.
+    x, y = (1 - (2 * np.arange(side) + 1) / side for side in (width, height))
+    across, down = np.meshgrid(x * tan, y * (tan * height / width))
+    ways = np.stack([across, down, np.ones_like(across)], -1).reshape(-1, 3) @ camera.to_world[:3, :3].T
+    return Rays(camera.to_world[:3, 3], ways / np.linalg.norm(ways, axis=1, keepdims=True))

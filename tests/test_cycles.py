@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from planes import pixel_rays
 
 from mcdenoise.cli.generate import generate
 from mcdenoise.data import open_sequence
-from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
+from mcdenoise.data.camera_path import Camera, view_projection
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets

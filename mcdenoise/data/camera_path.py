@@ -189,42 +189,14 @@ def view_projection(camera: Camera, width: int, height: int, near: float, far: f
     Returns:
         ``(4, 4)`` matrix for row vectors.
     """
-    tan_x, tan_y = _half_extent(camera, width, height)
+    tan_x = math.tan(math.radians(camera.fov_x) / 2)
+    tan_y = tan_x * height / width
     projection = np.zeros((4, 4))
     projection[0, 0] = -1 / tan_x
     projection[1, 1] = -1 / tan_y
     projection[2, 2:] = far / (far - near), -far * near / (far - near)
     projection[3, 2] = 1
     return np.asarray((projection @ np.linalg.inv(camera.to_world)).T)
-
-
-@dataclass(frozen=True, eq=False)
-class PixelRays:
-    """Rays through the pixel centres, row by row from the top left, in world space.
-
-    Args:
-        origin: ``(3,)`` common origin.
-        directions: ``(H*W, 3)`` unit vectors.
-    """
-
-    origin: Array
-    directions: Array
-
-
-def pixel_rays(camera: Camera, width: int, height: int) -> PixelRays:
-    """The camera rays through the centres of ``width`` x ``height`` pixels."""
-    tan_x, tan_y = _half_extent(camera, width, height)
-    x = (1 - (2 * np.arange(width) + 1) / width) * tan_x  # camera x points left, camera y up
-    y = (1 - (2 * np.arange(height) + 1) / height) * tan_y
-    directions = np.ones((height, width, 3))
-    directions[..., 0], directions[..., 1] = x, y[:, None]
-    directions = directions.reshape(-1, 3) @ camera.to_world[:3, :3].T
-    return PixelRays(camera.to_world[:3, 3], directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def _half_extent(camera: Camera, width: int, height: int) -> tuple[float, float]:
-    tan_x = math.tan(math.radians(camera.fov_x) / 2)
-    return tan_x, tan_x * height / width
 
 
 def _check_pose(matrix: Array) -> Array:

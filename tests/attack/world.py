@@ -10,10 +10,11 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 import torch
+from planes import pixel_rays
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
-from mcdenoise.data.camera_path import Camera, pixel_rays, view_projection
+from mcdenoise.data.camera_path import Camera, view_projection
 from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_clean_features
 from mcdenoise.data.shards import write_shard
 from mcdenoise.frame import Frame

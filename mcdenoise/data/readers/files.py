@@ -34,7 +34,7 @@ from mcdenoise.motion import USUAL_MOTION, Convention, convert
 # Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
 # Distance of the sky relative to everything else.
-_SKY = 1000.0
+SKY = 1000.0
 # Lossy compression may change black to a negative value of at most this size.
 _LOSSY = 1e-3
 
@@ -275,7 +275,7 @@ class RenderedFiles(FrameSequence):
             # In double precision, without converting all positions to it at once.
             w = np.einsum("hwc,c->hw", position, matrix[:3, 3]) + matrix[3, 3]
             images.setdefault("depth", np.where(known & (w > 0), w, 0)[..., None].astype(np.float32))
-            position[~known] = _far_points(matrix, float(w[known].max(initial=1)), ~known)
+            position[~known] = far_points(matrix, float(w[known].max(initial=1)), ~known)
             images["position"] = position
             seen = ~nothing_hit(images["depth"])
         if self.drops_positions or matrix is None:
@@ -387,12 +387,18 @@ def world_to_camera(metadata: Metadata) -> Array | None:
     return None
 
 
-def _far_points(matrix: Array, depth: float, sky: Mask) -> Array:
-    """``(N, 3)`` points far behind all others for pixels of the sky, so that the sky can be reprojected."""
+def far_points(matrix: Array, depth: float, sky: Mask) -> Array:
+    """``(N, 3)`` points far behind all others for pixels of the sky, so that the sky can be reprojected.
+
+    Args:
+        matrix: ``(4, 4)`` row-vector world-to-clip matrix, clip y down, clip w the depth along the view axis.
+        depth: largest depth of all others.
+        sky: ``(H, W)``, the pixels.
+    """
     (height, width), (rows, columns) = sky.shape, np.nonzero(sky)
     screen = np.stack([(columns + 0.5) / width * 2 - 1, (rows + 0.5) / height * 2 - 1, np.ones(len(rows))], -1)
     columns_used = matrix[:, [0, 1, 3]]
-    result: Array = (_SKY * depth * screen - columns_used[3]) @ np.linalg.pinv(columns_used[:3])
+    result: Array = (SKY * depth * screen - columns_used[3]) @ np.linalg.pinv(columns_used[:3])
     return result
 
 

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mcdenoise.data.camera_path import Array, Camera, check_moves, pixel_rays
+from mcdenoise.data.camera_path import Array, Camera, check_moves, view_projection
 from mcdenoise.data.images import Image, read_channels, read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
 from mcdenoise.data.readers.diffuse_specular import find_splits
-from mcdenoise.data.readers.files import as_tensor
+from mcdenoise.data.readers.files import SKY, as_tensor, far_points
 from mcdenoise.data.readers.layers import layers_of, read_files
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
@@ -41,8 +41,6 @@ _LIGHT = [
     *(f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")),
     *("emit", "environment"),
 ]
-# Distance of the sky relative to everything else; the reader uses the same value.
-_SKY = 1000.0
 _REFERENCE_STREAM = 1
 # Minimum ratio of reference samples to noisy samples: a reference with nearly the same noise would teach nothing.
 _CLEANER = 4
@@ -123,7 +121,7 @@ def render_cycles(
         take.scene,
         take.cameras,
         size,
-        (1e-3 * scale, 2 * _SKY * scale),
+        (1e-3 * scale, 2 * SKY * scale),
         moves,
         _CONVENTIONS,
         renderer=f"Blender {blender.version}, Cycles",
@@ -197,14 +195,13 @@ def buffers_of(images: Mapping[str, Image], camera: Camera, back: Mapping[int, A
         camera: camera of the frame.
         back: for each object index, the transform of its points to the previous frame.
     """
-    pose, position, depth = camera.to_world, images["Position"], images["Depth"]
-    height, width = depth.shape[:2]
+    pose, position, depth = camera.to_world, images["Position"].astype(np.float64), images["Depth"]
     known = (~nothing_hit(depth)) & np.isfinite(position).all(-1, keepdims=True)
-    # Like the reader for a user's file: put the sky far behind everything, so that it can be reprojected.
-    rays = pixel_rays(camera, width, height)
-    axis = (rays.directions @ pose[:3, 2]).reshape(height, width, 1)
-    far = _SKY * float(depth[known].max(initial=1))
-    position = np.where(known, position, rays.origin + far / axis * rays.directions.reshape(height, width, 3))
+    height, width, _ = depth.shape
+    sky = ~known[..., 0]
+    # Like the reader for a user's file.
+    matrix = view_projection(camera, width, height, near=1, far=2)
+    position[sky] = far_points(matrix, float(depth[known].max(initial=1)), sky)
     # In Blender's Denoising Normal, x points right, y up, and z into the scene.
     normal = np.nan_to_num(images["Denoising Normal"], nan=0, posinf=0, neginf=0) * (-1, 1, 1)
     buffers: dict[str, Any] = {
