@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from dataclasses import dataclass
@@ -147,25 +146,18 @@ def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> 
     initialiser = next((value for head, equals, value in statements if equals and word.search(head)), None)
     if initialiser is None:
         raise _malformed(path, name, expected, "it incomplete" if word.search(text) else "no such variable")
+    if not _INITIALISER.fullmatch(initialiser):
+        raise _malformed(path, name, expected, "something else")
+    values = np.array([float(each) for each in _NUMBER.findall(initialiser)])
+    # As in C, inner braces may be left out.
     try:
-        values = np.asarray(json.loads(_to_json(initialiser)), dtype=np.float64)
-    except (ValueError, RecursionError) as error:
-        raise _malformed(path, name, expected, "something else") from error
-    if values.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, values.shape, strict=True)):
-        raise _malformed(path, name, expected, f"shape {values.shape}")
+        values = values.reshape(shape)
+    except ValueError as error:
+        raise _malformed(path, name, expected, f"{values.size} numbers") from error
     # The header declares single precision, and frames store it.
     if not (np.abs(values) <= np.finfo(np.float32).max).all():
         raise _malformed(path, name, expected, "a number too large for single precision")
     return values
-
-
-def _to_json(initialiser: str) -> str:
-    """Turn ``{{1.f, -.5}}`` into ``[[1.0, -0.5]]``."""
-    if not _INITIALISER.fullmatch(initialiser):
-        raise ValueError("neither a number nor a brace nor a comma")
-    numbers = _NUMBER.sub(lambda match: repr(float(match[1])), initialiser)
-    # C allows a comma after the last element, JSON does not.
-    return re.sub(r",(?=\s*+\])", "", numbers.replace("{", "[").replace("}", "]"))
 
 
 def _literal(value: float | list[Any]) -> str:
