@@ -49,7 +49,7 @@ class Demodulated(Wrapper):
         del frame
         output, state = run(self.inner, handed, state)
         # A network that ends with a convolution returns half precision under autocast.
-        return output.lit(partial(_with, albedo), stages=wanted).noted(note), state
+        return output.lit(partial(remodulated, albedo), stages=wanted).noted(note), state
 
 
 def _without_albedo(frame: Frame) -> Frame:
@@ -69,7 +69,8 @@ def _without_albedo(frame: Frame) -> Frame:
     return frame.replace(**changes)
 
 
-def _with(albedo: Tensor, image: Tensor) -> Tensor:
+def remodulated(albedo: Tensor, image: Tensor) -> Tensor:
+    """The image, which may be of half precision, multiplied by the albedo in that of the albedo."""
     return by_rows(remodulate, image.to(albedo.dtype), albedo)
 
 

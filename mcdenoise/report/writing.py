@@ -136,7 +136,7 @@ def render_page(template: str, content: dict[str, Any]) -> str:
     # Methods and frames are in an order of their own.
     environment.policies["json.dumps_kwargs"] = {"sort_keys": False}
     parts = {name: (page / f"report.{name}").read_text(encoding="utf-8") for name in ("css", "js")}
-    return environment.get_template(template).render(**content, **parts)
+    return str(environment.get_template(template).render(**content, **parts))
 
 
 def _write_plots(folder: Path, results: Results, shown: list[View], names: list[str]) -> dict[str, Any]:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-from torch import Tensor, nn
+from torch import nn
 
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
+from mcdenoise.models.demodulated import remodulated
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
-from mcdenoise.ops import remodulate
 
 # Buffers that accumulation and Open Image Denoise provide, with their channels.
 ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
@@ -94,21 +95,12 @@ class Remodulated(Wrapper):
     @property
     def needs(self) -> Needs:
         """The needs of the inner method, and the albedo."""
-        needs = self.inner.needs
-        return Needs(needs.buffers | {"albedo"}, needs.uses, needs.trainable, needs.reach, needs.stride)
+        return replace(self.inner.needs, buffers=self.inner.needs.buffers | {"albedo"})
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         output, state = self.inner(frame, state)
-        if (albedo := frame.albedo) is None:
-            return output, state
-        stages = {name: _with(albedo, image) for name, image in output.stages.items()}
-        return Output(_with(albedo, output.image), stages), state
-
-
-def _with(albedo: Tensor, image: Tensor) -> Tensor:
-    # A network that ends with a convolution returns half precision under autocast.
-    return remodulate(image.to(albedo.dtype), albedo)
+        return output if frame.albedo is None else output.lit(partial(remodulated, frame.albedo)), state
 
 
 def split(model: Model) -> tuple[Front, Model]:
