@@ -73,6 +73,16 @@ def in_one_line(error: BaseException) -> str:
     return name
 
 
+def first_line(error: BaseException) -> str:
+    r"""The first line of an error's message that says anything, or the name of its type.
+
+    Example:
+        >>> first_line(RuntimeError("\n out of memory\nat ..."))
+        'out of memory'
+    """
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """A question that offers the known names nearest to one that is unknown; empty if none is near.
 

@@ -15,6 +15,7 @@ from torch.autograd.gradcheck import GradcheckError
 from mcdenoise.check.case import as_tuple, tensors_in
 from mcdenoise.check.cases import Case, Inputs, Op, map_tensors
 from mcdenoise.check.own import find_ops, op_of
+from mcdenoise.errors import first_line
 from mcdenoise.ops import use
 
 Function: TypeAlias = Callable[..., tuple[Tensor, ...]]
@@ -94,7 +95,7 @@ def check_case(op: Op, case: Case, order: int = 2) -> GradcheckResult:
             torch.manual_seed(SEED)
             message = _mismatch(op, case, order)
     except Exception as error:  # an op may raise any exception; it is reported, and the other cases continue
-        message = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        message = first_line(error)
     seconds = time.perf_counter() - start
     return GradcheckResult(op.name, case.name, case.differentiable, not message, seconds, message)
 

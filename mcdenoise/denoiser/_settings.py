@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 
 import torch
 
-from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.errors import InputError, did_you_mean, first_line
 from mcdenoise.models._registry import find_model
 
 
@@ -53,7 +53,5 @@ def usable_device(device: torch.device | str) -> torch.device:
         device = torch.device(device)
         torch.zeros((), device=device).item()
     except (RuntimeError, AssertionError, ImportError, TypeError) as error:
-        raise InputError(
-            f"device '{device}': expected one that torch can use, found: {str(error).splitlines()[0]}"
-        ) from error
+        raise InputError(f"device '{device}': expected one that torch can use, found: {first_line(error)}") from error
     return device

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, first_line
 from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._entries import Entry
 from mcdenoise.models._interface import Model
@@ -284,7 +284,7 @@ def describe_weights(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
     except (OSError, SafetensorError) as error:
-        found = getattr(error, "strerror", None) or str(error).splitlines()[0]
+        found = getattr(error, "strerror", None) or first_line(error)
         raise InputError(f"{path}: expected a safetensors file, found: {found}") from error
     if "architecture" not in metadata:
         raise InputError(f"{path}: expected weights saved by mcdenoise, found no 'architecture' in the header")

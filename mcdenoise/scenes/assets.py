@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.exr import read_exr
+from mcdenoise.data.files import make_folder
 from mcdenoise.errors import InputError
 from mcdenoise.reading import check_file, read_bytes
 from mcdenoise.user_cache import cache_file
@@ -189,10 +190,7 @@ def open_assets(folder: Path, say: Callable[[str], None], fetch: bool = True) ->
     Raises:
         InputError: the folder cannot be written, or an archive in it is damaged.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be created ({error.strerror}); choose another --assets") from error
+    make_folder(folder)
     furniture, images = folder / _FURNITURE, folder / "images"
     for target, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):
         if target.is_dir() or not fetch:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, first_line
 from mcdenoise.models._precision import Precision
 
 if TYPE_CHECKING:
@@ -56,9 +56,9 @@ def open_fabric(accelerator: str, precision: Precision, batch: int) -> Fabric:
         )
         fabric.launch()
     except (RuntimeError, ValueError, ImportError) as error:
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(
-            f"accelerator '{accelerator}': expected one that works here, such as cpu or cuda, found: {reason}"
+            f"accelerator '{accelerator}': expected one that works here, such as cpu or cuda, found: "
+            f"{first_line(error)}"
         ) from error
     return fabric
 

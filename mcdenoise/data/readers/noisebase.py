@@ -29,7 +29,7 @@ from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
-from mcdenoise.errors import InputError, import_optional
+from mcdenoise.errors import InputError, first_line, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.motion import miss
 
@@ -409,7 +409,7 @@ def _opened(path: Path, index: int | None = None) -> Iterator[_Arrays]:
         raise InputError(f"{path}: expected a zip of Noisebase, found no memory for a frame of it") from error
     # zipfile, zarr and numcodecs raise a dozen different exceptions for damaged data.
     except Exception as error:
-        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        reason = first_line(error)[:200]
         raise InputError(f"{path}: expected a zip of Noisebase, found it damaged ({reason}); copy it again") from error
 
 

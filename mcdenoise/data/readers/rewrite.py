@@ -22,6 +22,7 @@ from mcdenoise.data.exr import LARGEST_HALF, within_half, write_image
 from mcdenoise.data.files import atomic_path, cannot_write
 from mcdenoise.data.images import FORMATS, Image, Part, read_image_header, read_last_rows, read_picture
 from mcdenoise.data.radiance import encode
+from mcdenoise.errors import first_line
 
 # Names of the channels that DWA compression rounds, and its usual level.
 _DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45
@@ -79,7 +80,7 @@ def _write_exr(
             file = OpenEXR.File(str(copy), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except Exception as error:
-        return f"{source} cannot be read again: {_first_line(error)}"
+        return f"{source} cannot be read again: {first_line(error)}"
     if not whole:
         return f"{source} has changed meanwhile, or has parts that cannot be written again"
     for (index, name), image in channels.items():
@@ -103,7 +104,7 @@ def _write_exr(
         _put_back(target, originals)
         written = read_last_rows(target).parts
     except Exception as error:
-        return _first_line(error)
+        return first_line(error)
     return "" if len(written) == len(expected) else "incomplete"
 
 
@@ -127,10 +128,6 @@ def _leave_room(part: Any) -> float:
             channel.pixels = np.where(above, np.sign(pixels) * largest, pixels).astype(pixels.dtype)
             clamped = True
     return largest if clamped else 0.0
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _is_whole(found: Any, part: Part) -> bool:

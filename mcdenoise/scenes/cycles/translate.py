@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcdenoise.data.files import writing
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.shapes import Mesh, of_triangles, tessellate
 from mcdenoise.scenes.random.materials import METALS
@@ -50,12 +51,10 @@ class Description(NamedTuple):
         Raises:
             InputError: the folder cannot be written.
         """
-        try:
+        with writing(folder):
             (folder / "scene.json").write_text(json.dumps(self.content), encoding="utf-8")
             # Arrays of numbers only, so nothing is pickled.
             np.savez(folder / "scene.npz", **self.arrays)  # type: ignore[arg-type]
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be written ({error.strerror}); free space or check it") from error
 
 
 def translate(scene: Mapping[str, Any], movers: Collection[str] = (), *, seed: int = 0) -> Description:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.errors import InputError, import_optional
+from mcdenoise.errors import InputError, first_line, import_optional
 from mcdenoise.scenes.assets import Mesh
 
 Scene: TypeAlias = str | Path | Mapping[str, Any]
@@ -184,9 +184,3 @@ def _write_ply(path: Path, mesh: Mesh, to_world: Array) -> bool:
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
     return mesh.normals is not None
-
-
-def first_line(error: Exception) -> str:
-    """Of its message."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

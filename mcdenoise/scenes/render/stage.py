@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
-from mcdenoise.errors import InputError
-from mcdenoise.scenes.render.loading import LLVM, Scene, first_line, import_mitsuba, load_scene
+from mcdenoise.errors import InputError, first_line
+from mcdenoise.scenes.render.loading import LLVM, Scene, import_mitsuba, load_scene
 
 _MOST_NAMES = 20
 
