@@ -2,7 +2,7 @@
 
 from mcdenoise.evaluate.folder import Evaluation, Table, evaluate_folder, evaluate_method, find_images
 from mcdenoise.evaluate.halves import Halves, evaluate_halves
-from mcdenoise.evaluate.noise import noise_floor, reference_noise
+from mcdenoise.evaluate.noise import reference_noise
 from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references, measure
 from mcdenoise.metrics import Metric
 
@@ -20,6 +20,5 @@ __all__ = [
     "evaluate_method",
     "find_images",
     "measure",
-    "noise_floor",
     "reference_noise",
 ]

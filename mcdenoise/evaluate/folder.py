@@ -19,7 +19,7 @@ from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.opening import open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate.noise import noise_floor, reference_noise
+from mcdenoise.evaluate.noise import as_noisy, recorded_noise, reference_noise
 from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references
 from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
@@ -39,6 +39,8 @@ from mcdenoise.ops import Surface
 STRICT: ProtocolName = "strict"
 WARPED, FLICKER = "wRMSE", "flicker"
 _METRICS = {**{name: METRICS[name] for name in USUAL}, "HDR-FLIP": Metric(flip_hdr)}
+# Metrics by which the truth itself can be scored.
+_OF_FLOOR = {name: METRICS[name] for name in USUAL if name not in ("RMSE", "FLIP")}
 _OURS = re.compile(r"denoised\d+")
 # Maximum motion, in pixels, of a shot that counts as static.
 _STILL = 0.05
@@ -229,12 +231,14 @@ def _evaluate(
 ) -> Evaluation:
     """Evaluate images, each with its number, frame and reference."""
     tables = {name: Table(description=PROTOCOLS[name].description) for name in dict.fromkeys((STRICT, protocol))}
-    pairs = _Pairs(tables[STRICT])
+    pairs, floor, noise = _Pairs(tables[STRICT]), Scores(), recorded_noise(sequence)
     for number, image, frame, reference in images:
         for name, table in tables.items():
             if number in sequence.numbers[PROTOCOLS[name].skipped_frames :]:
                 table.add(_metrics(name), number, image, reference)
         pairs.add(number, frame, image, reference)
+        if number in noise:
+            floor.add(_OF_FLOOR, number, reference, as_noisy(reference, noise[number], seed=number))
         on_frame(number)
     pairs.finish()
     for name, table in tables.items():
@@ -245,8 +249,7 @@ def _evaluate(
             reason = "no two successive frames with references"
         missing = {metric: reason for metric in names if metric not in table.counts}
         table.skipped = {**missing, **table.skipped, **PROTOCOLS[name].missing}
-    floor = noise_floor(sequence, metrics=[name for name in USUAL if name not in ("RMSE", "FLIP")])
-    return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor)
+    return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor.mean)
 
 
 def _metrics(protocol: ProtocolName) -> Mapping[str, Metric]:

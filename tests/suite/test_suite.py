@@ -69,7 +69,7 @@ def test_rendering_resumes_and_shares_references(tmp_path: Path, two_shots: list
     first, still, second, _ = (open_row(row, tmp_path) for row in rows)
     assert (first.name, first.numbers, first.reference_numbers) == ("tiny-1", [0, 1], [1])
     assert (still.name, still.numbers) == ("tiny-1-still", [1])
-    assert first.reference(1).equal(second.reference(1))
+    assert first.frame(1).reference.equal(second.frame(1).reference)
     assert not first.frame(1).color.equal(second.frame(1).color)
     header = read_exr(tmp_path / "tiny-2" / "inputs" / "reference1.exr")[2]
     assert header["reference_spp"] == 8
@@ -107,7 +107,8 @@ def test_the_reader_reads_files_of_cycles(tmp_path: Path, scene: str) -> None:
     assert sequence.size == (9, 16)
     assert {"albedo", "normal", "depth", "motion", "reference"} <= sequence.buffers | {"reference"}
     assert sequence.reference_numbers == [1]
-    assert float(sequence.reference(1).mean()) == pytest.approx(float(sequence.frame(1).color.mean()), rel=0.5)
+    frame = sequence.frame(1)
+    assert float(frame.reference.mean()) == pytest.approx(float(frame.color.mean()), rel=0.5)
 
 
 def test_a_reference_is_the_mean_of_its_parts_with_an_estimate_of_its_noise(tmp_path: Path) -> None:

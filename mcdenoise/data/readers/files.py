@@ -139,9 +139,6 @@ class RenderedFiles(FrameSequence):
     def _metadata(self, number: int) -> Metadata:
         return read_image_header(self.file(self.choice.layers["color"], number)).metadata
 
-    def _reference(self, number: int) -> Tensor:
-        return as_tensor(self.read_buffers(number, ["reference"])["reference"])
-
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
         if noise_seed:
             return replace(self, groups=self.more[noise_seed - 1])._frame(number, reference, 0, buffers)

@@ -237,10 +237,6 @@ class _NoisebaseFiles(FrameSequence):
         """The arrays of one frame."""
         return _opened(self.zips[number], number if self.has_frames else None)
 
-    def _reference(self, number: int) -> Tensor:
-        with self.opened(number) as arrays:
-            return _tensor(arrays.mean("reference"))
-
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame:
         """Read means over samples: ``color``, features, and ``variance`` of the mean that the color is."""
         sampled = self.samples > 1 and (buffers is None or "samples" in buffers)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-from torch import Tensor
 
 from mcdenoise.data.images import Image, Metadata, Window
 from mcdenoise.data.readers.lights import Light
@@ -156,24 +155,6 @@ class Sequence(ABC):
         # They refer to a frame that was not selected, not to the previous one of this sequence.
         return frame.replace(motion=None, previous_position=None)
 
-    @any_values
-    def reference(self, number: int) -> Tensor:
-        """Read only the reference of one frame.
-
-        Args:
-            number: one of ``reference_numbers``.
-
-        Returns:
-            ``(1, 3, H, W)`` radiance, float32, on the CPU; the same as from :meth:`frame`.
-
-        Raises:
-            InputError: the frame does not exist, it has no reference, or the file is damaged.
-        """
-        self._check(number)
-        if number not in self.reference_numbers:
-            raise InputError(f"{self.root}: expected the reference of frame {number}, found none; render it")
-        return self._reference(number)
-
     def metadata(self, number: int) -> Metadata:
         """Attributes of the color file of one frame: texts, numbers and tuples of numbers.
 
@@ -242,9 +223,6 @@ class Sequence(ABC):
     def _metadata(self, number: int) -> Metadata:
         # Arrays have no attributes.
         return {}
-
-    @abstractmethod
-    def _reference(self, number: int) -> Tensor: ...
 
     @abstractmethod
     def _frame(self, number: int, reference: bool, noise_seed: int, buffers: Collection[str] | None) -> Frame: ...
