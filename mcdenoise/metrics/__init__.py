@@ -9,7 +9,6 @@ from mcdenoise.metrics.metric import Metric, UncomputableError
 from mcdenoise.metrics.protocols import PROTOCOLS, Protocol, aces_displayed, gamma_displayed
 from mcdenoise.metrics.temporal import (
     Flicker,
-    flicker_srgb,
     temporal_rmse_srgb,
     temporal_smape_linear,
     warped_rmse_srgb,
@@ -25,7 +24,6 @@ __all__ = [
     "aces_displayed",
     "display_codes",
     "displayed",
-    "flicker_srgb",
     "flip_hdr",
     "flip_srgb",
     "gamma_displayed",

@@ -141,37 +141,22 @@ def _warped_square(clip: Tensor, motion: Tensor, surface: Surface | None, previo
     return (weight * (clip[:, 1] - warped).square()).sum((-3, -2, -1)) / total
 
 
-def flicker_srgb(clip: Tensor, reference: Tensor) -> Tensor:
+class Flicker:
     """Flicker of a static shot: mean temporal standard deviation of the displayed values, minus the reference's.
 
     It is ``mean(std_t(x)) - mean(std_t(y))`` over pixels and channels of values clamped to [0, 1] with the sRGB curve,
     where the standard deviation is over the T frames with the divisor T. It is meaningful if neither the camera nor
     objects move. Moving lights contribute to both terms: a result that lags behind them can be below 0.
 
-    Args:
-        clip: ``(..., T, 3, H, W)`` scene-linear radiance of successive frames, T at least 2.
-        reference: of the same shape.
-
-    Returns:
-        ``(...)`` in [-0.5, 0.5]; closer to 0 is better.
-
-    Raises:
-        ValueError: the shapes differ, or there are fewer than two frames.
+    Frames are added one by one, and memory does not grow with their number.
 
     Example:
-        >>> still = torch.zeros(2, 3, 1, 1)
-        >>> round(flicker_srgb(torch.stack([still[0], still[0] + 1]), still).item(), 6)
+        >>> flicker, still = Flicker(), torch.zeros(3, 1, 1)
+        >>> for image in (still, still + 1):
+        ...     flicker.add(image, still)
+        >>> round(flicker.value().item(), 6)
         0.5
     """
-    check_clip(clip, reference)
-    flicker = Flicker()
-    for image, expected in zip(clip.unbind(-4), reference.unbind(-4), strict=True):
-        flicker.add(image, expected)
-    return flicker.value()
-
-
-class Flicker:
-    """Computes :func:`flicker_srgb` frame by frame; its memory does not grow with the length of the shot."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -179,7 +164,11 @@ class Flicker:
         self._mean = self._square = torch.zeros((), dtype=torch.float32, device="cpu")
 
     def add(self, image: Tensor, reference: Tensor) -> None:
-        """Add the next frame: ``(..., 3, H, W)`` scene-linear radiance, and its reference."""
+        """Add the next frame: ``(..., 3, H, W)`` scene-linear radiance, and its reference.
+
+        Raises:
+            ValueError: the shapes differ.
+        """
         check_images(image, reference)
         both = torch.stack([displayed(image), displayed(reference)])
         # Use Welford's update, because differences of squares would cancel for a converged image.
@@ -189,6 +178,6 @@ class Flicker:
         self._square = self._square + change * (both - self._mean)
 
     def value(self) -> Tensor:
-        """``(...)`` flicker of the frames added so far."""
+        """``(...)`` flicker of the frames so far, at least two, in [-0.5, 0.5]; closer to 0 is better."""
         deviation = (self._square / self.frames).clamp_min(0).sqrt().mean((-3, -2, -1))
         return deviation[0] - deviation[1]
