@@ -22,17 +22,17 @@ from torch import Tensor, nn
 
 import mcdenoise.benchmark.memory
 import mcdenoise.benchmark.sizes
+import mcdenoise.evaluate
 from mcdenoise.benchmark import Settings, Timed, benchmark_ops, choose_methods, make_method, run_benchmark
 from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.operators import largest_case
-from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.check.cases import OPS
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
-from mcdenoise.evaluate import evaluate_method
+from mcdenoise.evaluate import Scores, evaluate_method
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output
 from mcdenoise.models._weights import find_weights
@@ -203,32 +203,30 @@ def test_nothing_is_left_of_a_run_that_is_interrupted(small_sequence: Path, out:
 
 
 def test_temporal_errors_use_successive_frames_and_infinite_values_are_skipped() -> None:
-    errors = Errors()
+    errors = Scores()
+    metrics = {name: mcdenoise.evaluate.METRICS[name] for name in METRICS}
     reference = torch.full((1, 3, 16, 16), 0.25)
     for number, level in ((3, 0.25), (4, 0.5), (6, 0.75)):
-        errors.add("ours", number, torch.full_like(reference, level), reference)
-    means, spreads = errors.means("ours"), errors.spreads("ours")
+        errors.add(metrics, number, torch.full_like(reference, level), reference)
     # |x - y| / (x + y + 0.01) of 0, 0.25 and 0.5; frame 6 has no previous frame.
     smape = [0, 0.25 / 0.76, 0.5 / 1.01]
-    assert means["SMAPE"] == pytest.approx(sum(smape) / 3)
-    assert spreads["SMAPE"].median == pytest.approx(smape[1])
-    assert spreads["tSMAPE"].count == spreads["tRMSE"].count == 1
+    assert errors.finite["SMAPE"] == pytest.approx(smape)
+    assert len(errors.finite["tSMAPE"]) == len(errors.finite["tRMSE"]) == 1
     # The first image equals its reference.
-    assert "PSNR" not in means
-    assert "PSNR" not in spreads
-    assert errors.means("theirs") == {}
+    assert "PSNR" not in errors.finite
 
 
 def test_a_metric_that_cannot_be_computed_is_skipped_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    errors = Errors(("SMAPE", "SSIM", "FLIP"))
+    errors = Scores()
+    metrics = {name: mcdenoise.evaluate.METRICS[name] for name in ("SMAPE", "SSIM", "FLIP")}
     image = torch.full((1, 3, 10, 20), 0.5)
-    errors.add("ours", 0, image, image)
-    assert errors.means("ours") == {"SMAPE": 0}
+    errors.add(metrics, 0, image, image)
+    assert errors.finite == {"SMAPE": [0]}
     assert "11 x 11 pixels, found 10 x 20" in errors.skipped["SSIM"]
     assert "flip-evaluator" in errors.skipped["FLIP"]
     with pytest.raises(ValueError, match="reference:"):
-        errors.add("wrong", 0, image[..., :6], image)
+        errors.add(metrics, 0, image[..., :6], image)
 
 
 # The command

@@ -11,12 +11,12 @@ from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed, make_method
-from mcdenoise.benchmark.scoring import Errors
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
@@ -24,7 +24,7 @@ from mcdenoise.data.files import make_folder, new_folder
 from mcdenoise.data.images import Metadata
 from mcdenoise.data.sequences import with_unique_names
 from mcdenoise.errors import InputError, MissingBufferError, in_one_line
-from mcdenoise.evaluate import USUAL, check_references, reference_noise
+from mcdenoise.evaluate import METRICS, USUAL, Scores, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models._report import Stage, summarize
 from mcdenoise.models._stopwatch import Stopwatch
@@ -128,7 +128,7 @@ def _measure(
     for sequence in with_unique_names(sequences):
         run = _SceneRun(sequence, made, folder, settings)
         scene, own = run.measure(step)
-        skipped |= run.errors.skipped
+        skipped |= run.skipped
         scenes.append(scene)
         cells += own
     costs, fits = measure_sizes(
@@ -174,7 +174,9 @@ class _SceneRun:
     """Runs all methods on one scene."""
 
     def __init__(self, sequence: Sequence, made: _Made, folder: Path, settings: Settings) -> None:
-        self.errors = Errors(settings.metrics)
+        self.skipped: dict[str, str] = {}
+        self._scores = {method.name: Scores(skipped=self.skipped) for method in made.methods}
+        self._metrics = {name: METRICS[name] for name in METRICS if name in settings.metrics}
         self._sequence, self._made, self._settings = sequence, made, settings
         self._failures = dict(made.failures)
         self._lacking: set[str] = set()
@@ -223,7 +225,8 @@ class _SceneRun:
                     image = timed(frame)
                     self._planned[method.name].append(list(timed.denoiser.report.stages.values()))
                     if frame.reference is not None:
-                        self.errors.add(method.name, number, image, frame.reference)
+                        with torch.inference_mode():
+                            self._scores[method.name].add(self._metrics, number, image, frame.reference)
                 if kept and image is not None and method.name not in self._failures:
                     self._keep(method.folder, number, image, primaries)
             on_step()
@@ -298,13 +301,14 @@ class _SceneRun:
         if name in self._failures:
             shutil.rmtree(self._folder / IMAGES / self._scene.name / method.folder, ignore_errors=True)
             return Cell(self._scene.name, name, failure=self._failures[name], lacking=name in self._lacking)
+        errors = self._scores[name].finite
         times = {stage: Spread.of(values) for stage, values in self._times[name].items()}
         frames = functools.partial(_first_two_frames, self._sequence.root, tuple(self._sequence.numbers[:2]))
         return Cell(
             self._scene.name,
             name,
-            self.errors.means(name),
-            self.errors.spreads(name),
+            {metric: sum(values) / len(values) for metric, values in errors.items()},
+            {metric: Spread.of(values) for metric, values in errors.items()},
             whole=times[_WHOLE],
             stages={stage: times[stage] for stage in STAGES if stage in times},
             memory=self._made.peaks.of(method, self._sequence.size, frames) if self._settings.memory else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -97,6 +98,11 @@ class Scores:
             for name, value in values.items():
                 columns[name].append(value)
         return columns
+
+    @property
+    def finite(self) -> dict[str, list[float]]:
+        """The columns without infinite values, such as the PSNR of a perfect image."""
+        return {name: own for name, own in self.columns.items() if all(map(math.isfinite, own))}
 
     @property
     def mean(self) -> dict[str, float]:
