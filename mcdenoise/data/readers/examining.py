@@ -6,14 +6,12 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array
 from mcdenoise.data.images import Image, Mask
 from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.diffuse_specular import SPECULAR_ALBEDO, Split
-from mcdenoise.data.readers.files import RenderedFiles, world_to_camera
+from mcdenoise.data.readers.files import RenderedFiles, as_tensor, world_to_camera
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import is_same
 from mcdenoise.data.readers.samples import SampleLayers, mean_is
@@ -76,11 +74,6 @@ def examine(shot: RenderedFiles, color_has_albedo: bool | None) -> dict[str, Ima
     return images
 
 
-def _as_tensor(image: Image) -> Tensor:
-    """``(1, C, H, W)``, which shares the memory."""
-    return torch.from_numpy(image).permute(2, 0, 1)[None]
-
-
 def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list[str], stated: bool | None) -> None:
     if shot.part_of(shot.choice.layers["color"]).display_referred:
         words.append("display values, made linear")
@@ -93,7 +86,7 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     given = (albedo, np.nan_to_num(images["normal"]) if "normal" in images else None)
     # Once a shot: to load the compiled form would take longer than plain torch does.
     with use("torch"):
-        spread = noise_is_spread(_as_tensor(color), *(None if each is None else _as_tensor(each) for each in given))
+        spread = noise_is_spread(as_tensor(color), *(None if each is None else as_tensor(each) for each in given))
     if spread:
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
