@@ -229,9 +229,6 @@ def test_a_metric_that_cannot_be_computed_is_skipped_with_its_reason(monkeypatch
         errors.add(metrics, 0, image[..., :6], image)
 
 
-# The command
-
-
 def absent(quality: str = "high") -> Model:
     try:
         import no_such_package  # type: ignore[import-not-found]
@@ -350,9 +347,6 @@ def test_bad_arguments_are_rejected_before_measuring(
     assert [path.name for path in out.iterdir()] == ["old"]
 
 
-# Methods
-
-
 def test_some_methods_in_some_precisions() -> None:
     names = "wild(alpha_min=0.1|0.2), wild_small"
     methods = choose_methods(names, precisions="bfloat16", keep_all=True, baselines=())
@@ -454,9 +448,6 @@ def test_a_method_that_hangs_is_given_up(tmp_path: Path) -> None:
     wait_for_end(int((tmp_path / "process").read_text()))
 
 
-# Operators
-
-
 def test_ops_are_compared_with_their_equation_and_with_a_copy(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcdenoise.benchmark.operators, "_COPY_BYTES", 2**20)
     names = ("kernel_conv", "downsample")
@@ -505,9 +496,6 @@ def test_the_command_for_ops(out: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert "op: expected one of" in run("--ops", "no-such-op")[2]
 
 
-# Skipping
-
-
 def test_methods_are_also_measured_without_skipping(small_sequence: Path, out: Path) -> None:
     # A static camera: all frames have the matrix and the position of the first.
     inputs = small_sequence / "inputs"
@@ -523,8 +511,6 @@ def test_methods_are_also_measured_without_skipping(small_sequence: Path, out: P
     results = Results.read(out)
     assert results.command.endswith(" --keep-all")
     short, whole = (results.cell("plane", name) for name in ("wild", "wild, keep all"))
-    assert short is not None
-    assert whole is not None
     skipped = {row["stage"]: row["skipped"] for row in short.plan}
     assert skipped["reproject"] == 0.75
     assert not any(row["skipped"] for row in whole.plan)

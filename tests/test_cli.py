@@ -51,9 +51,6 @@ def whole_images(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-# Help
-
-
 LIMITS = {"commands": 13, "options": 140}
 
 
@@ -78,9 +75,6 @@ def test_summary_and_version() -> None:
     status, text, _ = run("--version")
     assert status == 0
     assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", text)
-
-
-# Bad usage
 
 
 @pytest.mark.parametrize(
@@ -108,9 +102,6 @@ def test_bad_usage(monkeypatch: pytest.MonkeyPatch, arguments: list[str], expect
 
 def test_unknown_command() -> None:
     assert "denoise" in refuses("denoize").partition("expected")[2]
-
-
-# Bad input
 
 
 @pytest.mark.parametrize(
@@ -275,9 +266,6 @@ def test_names_that_the_standard_output_cannot_show(small_sequence: Path, tmp_pa
     assert "M\\xfcller, \\u6620\\u753b" in done.stdout
 
 
-# Successful commands
-
-
 def test_denoise(denoise: list[Any], out: Path, tmp_path: Path) -> None:
     figures = tmp_path / "times.json"
     status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures, "--keep-all")
@@ -367,9 +355,6 @@ def test_models(tmp_path: Path) -> None:
     assert "kernel_conv" in listed["--ops"]
 
 
-# Training and rendering
-
-
 def test_train(denoise: list[Any], small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     model = ["--model", "cascaded", "--settings", "width=4"]
@@ -399,7 +384,6 @@ def test_generate(out: Path) -> None:
         for number in range(2):
             frame, again = (found.frame(number, noise_seed=k) for k in range(2))
             frame.validate()
-            assert frame.reference is not None
             assert (frame.previous_position is not None) is moves
             assert not torch.equal(frame.color, again.color)
     times = {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")}
@@ -421,9 +405,6 @@ def test_generate_with_bad_options(out: Path, option: str, value: str, expected:
     message = refuses("generate", "-o", out, "--assets", "none", "--variant", "scalar_rgb", option, value)
     assert expected in message
     assert not out.exists()
-
-
-# Separate processes
 
 
 def test_a_json_that_cannot_be_written_is_rejected_before_the_work(denoise: list[Any], out: Path) -> None:

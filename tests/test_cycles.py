@@ -3,8 +3,6 @@
 The variable BLENDER_PYTHON names an interpreter with ``bpy``; without it nothing is rendered.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

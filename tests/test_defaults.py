@@ -119,8 +119,6 @@ def test_weights_of_too_many_digits_are_told(small_sequence: Path) -> None:
     assert Denoiser(model.float())(random_shot(0, 40, 48, 1)[0]).dtype == torch.float32
 
 
-# Arguments of another kind
-
 WRONG: list[dict[str, Any]] = [
     *({"tile": value} for value in ("64", 64.0, True, [64], -1, 65)),
     *({"max_memory": value} for value in ("1", True, float("nan"), -1, 0, [1])),

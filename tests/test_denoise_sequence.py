@@ -83,9 +83,6 @@ def test_the_report_of_a_sequence(small_sequence: Path, tmp_path: Path) -> None:
     assert report.milliseconds["network"] == network[1]
 
 
-# Reading and writing beside the network
-
-
 class Slow(nn.Module):
     """A network that changes nothing, and takes its time."""
 
@@ -196,9 +193,6 @@ def test_an_old_report_does_not_survive_a_run_that_fails(small_sequence: Path, t
     with pytest.raises(InputError):
         denoise_sequence(sequence, out, Denoiser(small_model()), "small")
     assert not (out / "denoise.json").exists()
-
-
-# Skipped work
 
 
 @pytest.mark.parametrize(

@@ -145,9 +145,6 @@ def test_what_measures_runs(name: str, small_sequence: Path, tmp_path: Path) -> 
     assert run(name, *MEASURING[name].format(shot=small_sequence, out=tmp_path).split())
 
 
-# Scenes
-
-
 @pytest.mark.parametrize("folder", sorted((EXAMPLES / "scenes").iterdir()), ids=lambda folder: folder.name)
 def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
@@ -162,11 +159,7 @@ def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
         # The scene is lit and visible.
         assert (frame.color > 0).float().mean() > 0.2
         depth = frame.with_depth().depth
-        assert depth is not None
         assert depth.isfinite().float().mean() > 0.5
-
-
-# The paper's tables
 
 
 @pytest.fixture
@@ -230,9 +223,6 @@ def test_paper_tables_of_the_available_runs(dataset: Path, tmp_path: Path) -> No
 
 def cells_of(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
-
-
-# Skipping
 
 
 def test_skipped_shows_five_shots_of_a_scene(small_sequence: Path) -> None:

@@ -86,12 +86,8 @@ def test_a_lamp_among_reflectances_is_clamped_with_a_warning() -> None:
     albedo[..., 0] = 93
     with pytest.warns(UserWarning, match=r"'albedo': .* 93"):
         clean, _ = Frame(color=plane(3), albedo=albedo).validate()
-    assert clean.albedo is not None
     assert (clean.albedo[..., 0] == 1).all()
     assert (clean.albedo[..., 1:] == 0.5).all()
-
-
-# The whole vocabulary
 
 
 def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
@@ -143,9 +139,6 @@ def test_depth_is_the_clip_w_of_positions() -> None:
         assert other.with_depth() is other
 
 
-# A frame is a pytree
-
-
 def loaded_frame() -> Frame:
     return full_frame().replace(
         samples=torch.rand(2, 4, 3, *SIZE),
@@ -180,7 +173,6 @@ def test_a_frame_comes_apart_and_together(make: object) -> None:
 
 def test_torch_func_takes_frames() -> None:
     def loss(frame: Frame) -> Tensor:
-        assert frame.depth is not None
         return (frame.color.square() * frame.depth).sum()
 
     frame = Frame(color=torch.rand(2, 3, *SIZE), depth=plane(1, 3.0))

@@ -33,13 +33,10 @@ def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None
     assert frame.buffers == {*names, "view_projection", "samples", "crypto", "matte"}
     for seed, name in enumerate(names):
         tensor = frame.buffer(name)
-        assert tensor is not None
         assert tensor.shape == (1, BUFFERS[name].channels, HEIGHT, WIDTH)
         pixels = image(BUFFERS[name].channels, seed=seed)
         assert torch.equal(tensor[0].permute(1, 2, 0), torch.from_numpy(pixels)), name
-    assert frame.view_projection is not None
     assert torch.equal(frame.view_projection[0], torch.from_numpy(matrix))
-    assert frame.samples is not None
     assert torch.equal(frame.samples[0, 1].permute(1, 2, 0), torch.from_numpy(image(5, seed=51)))
     assert torch.equal(frame.extra["crypto"][0].permute(1, 2, 0), torch.from_numpy(image(2, seed=60)))
     assert frame.extra["matte"].shape == (1, 1, HEIGHT, WIDTH)
@@ -182,9 +179,6 @@ def test_a_warning_shows_the_line_of_the_caller() -> None:
         with pytest.warns(UserWarning, match="buffer 'albedo'") as caught:
             function()
         assert [each.filename for each in caught] == [__file__]
-
-
-# A still in one call
 
 
 @pytest.mark.parametrize(("layout", "dtype"), [("HWC", np.float16), ("CHW", np.float64)])

@@ -126,7 +126,6 @@ def end(process: subprocess.Popen[str], number: signal.Signals, name: str, lines
 def interrupt(folder: Path, moment: str, number: signal.Signals = signal.SIGINT) -> None:
     (folder / "slow_module.py").write_text("import time\ntry:\n    time.sleep(60)\nexcept BaseException:\n    pass\n")
     process = started(OWN.replace("{moment}", moment), "wait", folder=folder)
-    assert process.stdout is not None
     assert process.stdout.readline() == "begun\n"
     # Wait until it does what is meant: a file is only written once its reader is loaded.
     deadline = time.monotonic() + 60
@@ -156,7 +155,6 @@ def test_other_signals_end_it_alike(tmp_path: Path) -> None:
 def test_signals_that_were_ignored_stay_ignored(tmp_path: Path) -> None:
     before = "import signal\nsignal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
     process = started(before + OWN.replace("{moment}", "time.sleep(1)"), "wait", folder=tmp_path)
-    assert process.stdout is not None
     process.stdout.readline()
     os.killpg(process.pid, signal.SIGHUP)
     assert process.communicate(timeout=60) == ("", "")
@@ -182,7 +180,6 @@ def test_a_few_moments_of_denoise(tmp_path: Path) -> None:
     for seconds, number in ((0.5, signal.SIGINT), (3.0, signal.SIGTERM)):
         options = ("-o", tmp_path / "out", "--model", "wild_small")
         process = started(OBEYING, "denoise", tmp_path / "inputs", *options, folder=tmp_path)
-        assert process.stdout is not None
         process.stdout.readline()
         time.sleep(seconds)
         end(process, number, "denoise")

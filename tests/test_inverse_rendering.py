@@ -15,8 +15,6 @@ PATH = Path(__file__).resolve().parents[1] / "examples" / "inverse_rendering.py"
 @pytest.fixture(scope="module")
 def example() -> ModuleType:
     spec = importlib.util.spec_from_file_location("inverse_rendering", PATH)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["inverse_rendering"] = module
     spec.loader.exec_module(module)

@@ -98,9 +98,6 @@ def smape(image: Array, reference: Array) -> float:
     return float(np.mean(2 * np.abs(image - reference) / (np.abs(image) + np.abs(reference) + 0.01)))
 
 
-# Bitmaps
-
-
 def test_the_example_of_the_page_runs(mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     text = (Path(__file__).resolve().parents[1] / "docs" / "mitsuba.md").read_text(encoding="utf-8")
@@ -183,9 +180,6 @@ def test_albedo_and_normals_of_mitsuba_are_mended(mi: Any) -> None:
     rough, overshot = albedo.copy(), normals.copy()
     rough[3:6], albedo[3:6], overshot[7], normals[7] = 93, 1, -1.5, -1
     assert np.array_equal(result(rough, overshot), result(albedo, normals))
-
-
-# Tensors
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
@@ -274,9 +268,6 @@ def test_gradients_end_at_the_history(ad: Any) -> None:
     assert np.abs(drjit.grad(first).numpy()).max() > 0
 
 
-# A shot
-
-
 def test_flow_leads_from_the_previous_to_the_current_frame(mi: Any) -> None:
     """The pattern at x is now at x + 2 and y + 1: with a flow of (2, 1), the history equals the current frame."""
     pattern, moved = noise(3), np.roll(noise(3), (1, 2), axis=(0, 1))
@@ -314,9 +305,6 @@ def test_previous_denoised_tells_where_a_shot_begins(mi: Any) -> None:
         for frame, before in ((frames[1], result), (frames[2], previous)):
             result = denoiser(frame, flow=flow, previous_denoised=before)
         np.testing.assert_allclose(result.numpy(), expected.numpy(), rtol=1e-3, atol=1e-3)
-
-
-# Bad input
 
 
 def test_arguments_that_do_not_fit_are_told_in_one_line(mi: Any) -> None:

@@ -1,7 +1,5 @@
 """Rendering with the real Mitsuba: what the files promise about pixel centres, noise and references."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import json
@@ -115,7 +113,6 @@ def test_the_reader_understands_the_folder(sequence: Path) -> None:
     frame = found.frame(1)
     assert isinstance(frame, Frame)
     frame.validate()
-    assert frame.reference is not None
     assert torch.equal(frame.color[0].permute(1, 2, 0), torch.from_numpy(read(sequence, "color1")))
 
 
@@ -225,7 +222,6 @@ def test_known_radiance_and_the_background(tmp_path: Path) -> None:
     assert (read(folder, "albedo0")[~hit] == 0).all()
     # The reader turns the far point that stands for the background into infinite depth.
     depth = open_sequence(tmp_path).frame(0).depth
-    assert depth is not None
     assert torch.equal(torch.isinf(depth[0, 0]), torch.from_numpy(~hit))
 
 
@@ -334,7 +330,6 @@ def test_noise_seeds_are_independent_and_have_one_expectation(tmp_path: Path) ->
     assert sequence.noise_seeds == describe(folder)["noise_seeds"] == count
     frames = [sequence.frame(0, noise_seed=k) for k in range(count)]
     reference = frames[0].reference
-    assert reference is not None
     colors = torch.cat([frame.color for frame in frames]).double().flatten(1)
     # Single pixels are too skewed for it, whole images are not.
     whole = colors.mean(1)
@@ -520,7 +515,6 @@ def test_history_follows_what_moves(moving: Path) -> None:
         state = None
         for number in sequence.numbers:
             frame, _ = sequence.frame(number).validate()
-            assert frame.previous_position is not None
             moved = (frame.previous_position != frame.position).any(1, keepdim=True)
             output, state = accumulated(frame if known else frame.replace(previous_position=None), state)
         report = FrameReport()
@@ -599,8 +593,6 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     sequence = open_sequence(out)
     assert (len(sequence), sequence.noise_seeds) == (2, 2)
     frame = sequence.frame(1)
-    assert frame.position is not None
-    assert frame.previous_position is not None
     step = frame.position - frame.previous_position
     step = step[:, :, (step != 0).any(1)[0]]
     assert step.shape[2] > 5
@@ -630,12 +622,9 @@ def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
     assert "samples" in sequence.buffers & sequence.noisy
     first, second = (sequence.frame(1, noise_seed=k) for k in range(2))
     for frame in (first, second):
-        assert frame.samples is not None
         assert frame.samples.shape == (1, 3, 3, HEIGHT, WIDTH)
         # Each image is rounded to half floats.
         torch.testing.assert_close(frame.samples.mean(1), frame.color, rtol=2 * 2.0**-11, atol=2.0**-24)
-    assert first.samples is not None
-    assert second.samples is not None
     assert not torch.equal(first.samples, second.samples)
     # Samples of their own: no two are alike.
     assert not torch.equal(first.samples[:, 0], first.samples[:, 1])

@@ -1,7 +1,5 @@
 """Progressive references: halves, and the remaining noise."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +30,6 @@ def test_noise_is_the_smape_against_the_truth(start: int) -> None:
     truth = np.linspace(0.1, 4, PIXELS * 3).reshape(PIXELS, 3)
     images = (torch.from_numpy(image.T.reshape(3, 1, PIXELS)) for image in (halves.mean(), truth))
     noise = halves.noise()
-    assert noise is not None
     # Measured: within 1 %.
     np.testing.assert_allclose(noise, smape_linear(*images).item(), rtol=0.03)
     assert (halves.spp, halves.passes) == (start + 96, start + 6)

@@ -52,8 +52,6 @@ def test_written_files_are_read_back(results: Results, tmp_path: Path) -> None:
     assert Results.read(tmp_path) == results
 
 
-# Damage of every kind, in every place
-
 HOSTILE: list[Any] = [None, True, -1, 1e300, "../..", "\x1b[2J", []]
 
 

@@ -16,8 +16,6 @@ from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.folder import denoise_sequence
 
-# Sequences
-
 
 @pytest.fixture
 def sequence(tmp_path: Path) -> Path:

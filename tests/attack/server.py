@@ -82,8 +82,6 @@ class Server:
 
     def run(self, *processes: Process) -> list[Ended]:
         """Start all processes at once, and wait for them."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         places = [f"{each.folder}/.output{i}" for i, each in enumerate(processes)]
         tasks = [asdict(each) | {"place": place} for each, place in zip(processes, places, strict=True)]
         self._process.stdin.write(json.dumps(tasks) + "\n")

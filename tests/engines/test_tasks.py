@@ -1,7 +1,5 @@
 """Tasks of lost workers are retried, tasks that raise errors fail alone."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

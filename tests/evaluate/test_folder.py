@@ -42,9 +42,6 @@ def changed(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> Non
     write_exr(path, pixels, channels, full_float=True)
 
 
-# Finding files
-
-
 @pytest.mark.parametrize(
     "names",
     [
@@ -79,9 +76,6 @@ def test_names_without_a_frame_number_are_rejected(tmp_path: Path, names: tuple[
         find_images(touched(tmp_path / "out", *names), [1, 2])
 
 
-# Values
-
-
 def test_every_value_is_that_of_its_function(small_sequence: Path, images: Path) -> None:
     pytest.importorskip("flip_evaluator")
     sequence = open_sequence(small_sequence)
@@ -98,15 +92,12 @@ def test_every_value_is_that_of_its_function(small_sequence: Path, images: Path)
         found = dict(table.frames[number])
         assert 0 < found.pop("HDR-FLIP") < 1
         warped = found.pop("wRMSE", None)
-        assert frame.reference is not None
         usual = {name: METRICS[name] for name in USUAL}
         assert found == pytest.approx(measure(usual, frame.color, frame.reference, previous), rel=1e-6)
         if number == 0:
             assert warped is None
             continue
         before = frames[number - 1]
-        assert frame.position is not None
-        assert before.view_projection is not None
         pair = slice(number - 1, number + 1)
         along = (
             motion_from_position(frame.position, before.view_projection),
@@ -150,9 +141,6 @@ def test_frames_that_are_not_successive_are_no_pair(small_sequence: Path, images
     assert table.skipped["tRMSE"] == "no two successive frames with references"
 
 
-# The references' own noise
-
-
 def test_the_truth_scores_the_noise_of_the_references(small_sequence: Path, images: Path) -> None:
     sequence = open_sequence(small_sequence)
     described = small_sequence / "inputs" / "camera.json"
@@ -177,9 +165,6 @@ def test_the_truth_scores_the_noise_of_the_references(small_sequence: Path, imag
     still = noted(0.0)
     assert still["SMAPE"] == still["tSMAPE"] == still["tRMSE"] == 0
     assert evaluate_folder(sequence, images).reference_noise == 0
-
-
-# Rejected input
 
 
 def test_a_sequence_without_references_is_rejected(small_sequence: Path, images: Path) -> None:

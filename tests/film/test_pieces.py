@@ -60,7 +60,6 @@ def test_pieces_do_not_depend_on_what_is_missing() -> None:
 def test_an_average_remembers_what_its_alpha_says() -> None:
     model = create_model("accumulated", alpha_min=0.25)
     frames = frames_remembered(model, 0.01)
-    assert frames is not None
     assert 0.75**frames <= 0.01 < 0.75 ** (frames - 1)
     assert frames_remembered(create_model("noisy"), 0.01) == 0
     assert frames_remembered(create_model("accumulated", alpha_min=1.0), 0.01) == 1

@@ -28,7 +28,6 @@ def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
     shot = write_shot(tmp_path / "renders/s", FRAMES)
     manifest, out = write_manifest(tmp_path / "film.toml", {"s": shot}, model="accumulated"), tmp_path / "out"
     process = started(OBEYING, "film", manifest, "-o", out, "--workers", 2, folder=tmp_path)
-    assert process.stdout is not None
     process.stdout.readline()
     until = time.monotonic() + SECONDS
     while not PHASES[phase](out):

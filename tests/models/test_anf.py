@@ -1,7 +1,5 @@
 """Affinity of neural features against its equations, and what it keeps from frame to frame."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -43,7 +41,6 @@ def test_pixels_of_another_surface_have_no_weight() -> None:
     """In a frame of another depth nothing of the one before is left, however bright it was."""
     model = drawn(Anf(6), 0.25)
     first, second, _ = shot()
-    assert second.depth is not None
     moved = second.replace(depth=2 * second.depth)
     for before in (first, first.replace(color=1e6 * first.color)):
         _, state = model(before)

@@ -1,7 +1,5 @@
 """A-SVGF: what its temporal gradients do to the history of SVGF."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from test_svgf import HEIGHT, WIDTH, frame, kept

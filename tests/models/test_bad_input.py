@@ -1,7 +1,5 @@
 """Every method refuses a frame, a state or a weights file that does not fit it, in one line, and computes nothing."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any
@@ -64,9 +62,6 @@ def shape_of(state: Any) -> Any:
 # Named, since to run every method while tests are collected would take a minute.
 KEEPING = [name for name in KINDS if name not in ("noisy", "oidn", "oidn_open")]
 DEMANDING = [name for name in KINDS if model_of(name).needs.buffers != {"color"}]
-
-
-# Buffers
 
 
 def said_to_do(message: str) -> list[str]:
@@ -138,9 +133,6 @@ def test_an_accumulated_buffer_that_comes_or_goes_begins_a_new_shot() -> None:
             assert torch.equal(image, alone(given))
     other = "other buffers than in the frame before"
     assert reasons == ["first frame", other, "", other]
-
-
-# States
 
 
 @torch.no_grad()
@@ -233,9 +225,6 @@ def test_wrappers_of_ones_own_refuse_one_anothers_states() -> None:
                 assert message.startswith("state: expected what ")
     message = refused(lambda: wearing["recurrent"](frame, states["accumulated"]))
     assert "expected what recurrent keeps of a frame, found (what accumulated keeps, None)" in message
-
-
-# Weights
 
 
 @functools.cache

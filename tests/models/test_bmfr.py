@@ -1,7 +1,5 @@
 """BMFR: its two accumulations, its fit between them, and its anti-aliasing."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -1,7 +1,5 @@
 """The paper's network against its equations, in float64, with those of the ops as loops over pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -46,9 +44,6 @@ def fused(network: Any, images: list[Tensor]) -> Tensor:
 
 def features(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     """Albedo, normal and depth in the range from 0 to 1."""
-    assert frame.albedo is not None
-    assert frame.normal is not None
-    assert frame.depth is not None
     depth = frame.depth
     hit = torch.isfinite(depth)
     typical = torch.exp(torch.log(depth[hit]).mean())
@@ -111,7 +106,6 @@ def test_the_whole_method_written_out() -> None:
     model = create_model("cascaded", width=8)
     drawn(model)
     frame = frame_of(*SIZE).to(torch.float64)
-    assert frame.albedo is not None
     textured = (frame.albedo >= 1e-4).any(1, keepdim=True)
     assert textured.all()
     divisor = frame.albedo.clamp_min(0.04)
@@ -152,7 +146,6 @@ def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:
 def test_without_bilateral_weights_features_matter_to_the_u_net_alone() -> None:
     """If the U-Net is blind, normals change the filtered image with the weights, and not without them."""
     frame = frame_of(*SIZE).to(torch.float64)
-    assert frame.normal is not None
     other = frame.replace(normal=frame.normal.flip(3))
     for bilateral, same in ((True, False), (False, True)):
         network = drawn(KernelNetwork(8, bilateral=bilateral))

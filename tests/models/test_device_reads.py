@@ -237,9 +237,6 @@ def test_repairs_are_those_of_validation() -> None:
         late.judge(late.numbers.tolist())
 
 
-# Time on an asynchronous device: marks are recorded, and nothing waits for them until they are requested.
-
-
 class Event:
     """A stand-in for ``torch.cuda.Event``, of a device that is as fast as this processor."""
 

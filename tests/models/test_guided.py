@@ -1,7 +1,5 @@
 """The guided filter: kornia's own, with all features for a guide."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from kornia.filters import guided_blur

@@ -1,7 +1,5 @@
 """The joint bilateral filter: kornia's own, in tiles, on accumulated light."""
 
-from __future__ import annotations
-
 import torch
 from kornia.filters import joint_bilateral_blur
 

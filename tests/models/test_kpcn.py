@@ -1,7 +1,5 @@
 """KPCN against its equations, in float64, with that of its filter as loops over pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -27,9 +25,6 @@ def parts(height: int, width: int, **changes: Any) -> Frame:
 def seen(image: Tensor, frame: Frame) -> Tensor:
     """The 27 channels."""
     albedo, normal, depth = frame.albedo, frame.normal, frame.depth
-    assert albedo is not None
-    assert normal is not None
-    assert depth is not None
     hit = torch.isfinite(depth)
     near = torch.where(hit, depth / (depth + torch.exp(torch.log(depth[hit]).mean())), 1)
     features = torch.cat([albedo, (normal + 1) / 2, near], 1)
@@ -115,8 +110,6 @@ def test_both_parts_have_a_history() -> None:
 @torch.no_grad()
 def test_layers_are_filtered_with_the_kernels_of_their_light() -> None:
     network, frame = drawn(KpcnNetwork(4, 3, 3), 0.1), parts(6, 7)
-    assert frame.diffuse is not None
-    assert frame.specular is not None
     layers = {"matt": frame.diffuse, "shiny": frame.specular}
     hints = Hints(alpha=True)
     alpha = torch.ones_like(frame.color[:, :1])

@@ -1,7 +1,5 @@
 """Layers that add up: parts of the color are denoised with its kernels, and still sum to the image. And alpha."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -55,9 +53,6 @@ def assert_sum(image: Tensor, layers: Mapping[str, Tensor]) -> None:
     # Second-order terms are far below one unit more; what is below the smallest normal number has no relative error.
     allowed = (len(layers) + 1 + 2 + 1) * unit * image.double().abs() + torch.finfo(image.dtype).tiny
     assert (error <= allowed).all(), float((error / allowed).max())
-
-
-# The zoo
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -149,8 +144,6 @@ def test_alpha_is_filtered_with_every_method(name: str) -> None:
     for frame in shot(denoiser.model):
         output = denoiser.output(frame)
         assert kept.output(frame).alpha is None
-        assert output.alpha is not None
-        assert frame.alpha is not None
         assert output.alpha.shape == frame.alpha.shape
         assert output.alpha.min() >= 0
         assert output.alpha.max() <= 1
@@ -165,7 +158,6 @@ def test_an_alpha_that_is_the_same_everywhere_stays(name: str, value: float) -> 
     denoiser = Denoiser(small(name), alpha=True)
     for frame in shot(denoiser.model):
         output = denoiser.output(frame.replace(alpha=torch.full_like(frame.color[:, :1], value)))
-        assert output.alpha is not None
         # A mean of up to 17x17 taps, each with a weight that is rounded.
         allowed = 17**2 * torch.finfo(torch.float32).eps / 2 * value
         assert (output.alpha - value).abs().max() <= allowed
@@ -183,9 +175,6 @@ def test_black_frames_have_black_layers(name: str) -> None:
 
 def _modules(model: Any) -> list[Any]:
     return list(model.modules()) if isinstance(model, nn.Module) else [model]
-
-
-# Requested layers
 
 
 def test_any_parts_of_the_color_may_be_asked_for() -> None:
@@ -273,9 +262,6 @@ def test_a_layer_that_is_no_radiance_is_refused() -> None:
         "layer 'a': expected shape (1, 3, 5, 6)"
     )
     assert refused(lambda: Frame(color, layers={"a": color.int()})).startswith("layer 'a': expected a floating-point")
-
-
-# The source of the proportions
 
 
 @torch.no_grad()

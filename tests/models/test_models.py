@@ -1,7 +1,5 @@
 """Properties of every model of the zoo, whatever its weights are; the tests read the register."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json
@@ -61,9 +59,6 @@ TRAINABLE = [name for name in KINDS if trainable(name)]
 def tensors(tree: Any) -> list[Tensor]:
     """The tensors of a state."""
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
-
-
-# The contract of a step
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -353,9 +348,6 @@ def test_a_gradient_goes_through_the_state(name: str) -> None:
     assert sum(float(gradient.abs().sum()) for gradient in gradients) > 0
 
 
-# The register
-
-
 def test_the_register() -> None:
     assert {"cascaded", *FAMILY} <= set(MODELS)
     assert sorted(MODELS) == MODELS
@@ -410,9 +402,6 @@ def test_a_module_of_images_is_a_method() -> None:
     crypto = torch.rand(1, 3, 4, 5)
     assert torch.equal(model(frame.replace(extra={"crypto": crypto}))[0].image, expected + crypto)
     assert as_model(lambda color: Output(color, {"half": color / 2}))(frame)[0].stages.keys() == {"half"}
-
-
-# Saving and loading
 
 
 @pytest.mark.parametrize("name", TRAINABLE)

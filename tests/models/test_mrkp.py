@@ -1,7 +1,5 @@
 """MRKP and KP against their equations, written out in float64 with loops."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

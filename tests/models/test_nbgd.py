@@ -1,7 +1,5 @@
 """The neural bilateral grid against its equations, written out in float64, and its published numbers."""
 
-from __future__ import annotations
-
 import torch
 from toys import drawn, frame_of, whole_frame
 

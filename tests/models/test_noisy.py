@@ -1,7 +1,5 @@
 """Doing nothing, and accumulation alone."""
 
-from __future__ import annotations
-
 import torch
 
 from mcdenoise.denoiser import Denoiser

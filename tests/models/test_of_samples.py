@@ -1,7 +1,5 @@
 """Methods of single samples: light without noise, layers, the order of samples, and logits of any size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -27,7 +25,6 @@ both = pytest.mark.parametrize("name", NETWORKS)
 def test_light_without_noise_comes_back(name: str) -> None:
     """The whole model: albedo and exposure of samples and color are undone, and alphas sum to one."""
     given = sampled(9, 8).to(torch.float32)
-    assert given.albedo is not None
     light = 2 * given.albedo.clamp_min(0.04)
     samples = light[:, None].repeat(1, 3, 1, 1, 1)
     output, _ = create_model(name, width=4)(given.replace(color=light, samples=samples))
@@ -50,7 +47,6 @@ def test_layers_of_light_and_alpha_go_where_the_samples_go(name: str) -> None:
 @torch.no_grad()
 def test_the_order_of_the_samples_does_not_matter(name: str) -> None:
     network, given = drawn(NETWORKS[name](), 0.4), sampled(5, 6, samples=4)
-    assert given.samples is not None
     turned = given.replace(samples=given.samples[:, [2, 0, 3, 1]])
     torch.testing.assert_close(network(turned)[0].image, network(given)[0].image, rtol=1e-10, atol=1e-10)
 
@@ -65,7 +61,6 @@ def test_logits_of_any_size_leave_a_mean() -> None:
     white = given.replace(color=torch.ones_like(given.color), samples=torch.ones(1, 3, 3, 5, 6).double())
     torch.testing.assert_close(network(white)[0].image, white.color, rtol=1e-12, atol=1e-12)
     image = network(given)[0].image
-    assert given.samples is not None
     assert torch.isfinite(image).all()
     assert image.max() <= given.samples.max()
 
@@ -74,7 +69,6 @@ def test_logits_of_any_size_leave_a_mean() -> None:
 def test_a_firefly_in_the_layer_behind_is_not_seen() -> None:
     """Where bright samples are behind and the front is opaque, the image is as without them, up to the least weight."""
     network, given = drawn(NETWORKS["layered"](), 0.4), sampled(5, 6)
-    assert given.samples is not None
     samples = given.samples.clone()
     samples[:, 0, :, 2, 3] = 1e3
 

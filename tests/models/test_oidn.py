@@ -1,7 +1,5 @@
 """Open Image Denoise as its own package calls it, in each of its settings."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """The table of models."""
 
-from __future__ import annotations
-
 import json
 import sys
 from importlib.metadata import EntryPoint
@@ -42,7 +40,6 @@ def test_lists_every_model_by_kind_and_name() -> None:
     small = by_name["wild_small"]
     assert (small.kind, by_name["svgf"].paper) == ("recurrent", "Schied et al. 2017")
     # Multiply-adds are no fewer than a sixteenth of the weights, of which each is used once in 4x4 pixels or more.
-    assert small.kmacs_per_pixel is not None
     assert small.kmacs_per_pixel > small.parameters / 64 / 1e3
     assert by_name["svgf"].needs == ["color", "depth", "normal"]
     assert by_name["noisy"].weights == "none"

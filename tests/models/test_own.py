@@ -1,7 +1,5 @@
 """A model of one's own: by the place of its factory, with a state, and what is wrong with it in one line."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

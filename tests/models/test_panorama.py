@@ -1,7 +1,5 @@
 """A panorama has no border: what it shows does not depend on the column at which it begins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Models that installed packages offer: a broken one is named where it is asked for, and hinders no other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The precision of convolutions if none is requested."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

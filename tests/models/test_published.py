@@ -1,7 +1,5 @@
 """Common properties of the methods in the paper's comparison."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The recurrent autoencoder against its equations, and what it remembers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -54,13 +52,9 @@ def test_the_normal_is_along_the_axes_of_the_image(perspective: bool) -> None:
     else:
         matrix[0, 3, 3] = 1
     frame = frame_of(4, 5, view_projection=matrix)
-    assert frame.normal is not None
     expected = torch.einsum("ac,bchw->bahw", torch.stack([right, down]), frame.normal)
     torch.testing.assert_close(view_normal(frame), expected)
     assert torch.equal(view_normal(frame.replace(view_projection=None)), frame.normal[:, :2])
-
-
-# The hidden state
 
 
 @torch.no_grad()
@@ -68,7 +62,6 @@ def test_a_cut_begins_anew_in_each_image_of_a_batch() -> None:
     model = drawn()
     first, second, _ = shot()
     _, state = model(Frame(**{name: buffer.repeat(2, 1, 1, 1) for name, buffer in first.items()}))
-    assert second.motion is not None
     motion = torch.cat([second.motion, torch.full_like(second.motion, 1e3)])
     both = Frame(**{name: buffer.repeat(2, 1, 1, 1) for name, buffer in second.items()}).replace(motion=motion)
     output, _ = model(both, state)

@@ -1,7 +1,5 @@
 """A method that is given its own image of the frame before: where it was, what no longer shows, and how it ends."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Renderers with a fixed seed: the noise of every frame is that of the first one."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

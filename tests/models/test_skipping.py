@@ -1,7 +1,5 @@
 """Work that a scene does not need is skipped, and the pixels stay the same, or as near as was requested."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -45,9 +43,6 @@ def wall(seed: int, noise: float = 1.0, size: tuple[int, int] = (HEIGHT, WIDTH),
 
 def sky(frame: Frame, rows: int) -> Frame:
     """Return the frame with a clear sky at the top."""
-    assert frame.albedo is not None
-    assert frame.normal is not None
-    assert frame.depth is not None
     above = torch.arange(frame.size[0])[:, None].expand(1, 1, *frame.size) < rows
     blue = torch.tensor([0.2, 0.4, 0.9]).reshape(1, 3, 1, 1) * torch.linspace(1, 2, frame.size[0])[:, None]
     return frame.replace(
@@ -68,9 +63,6 @@ def pair(model: nn.Module | None = None, tolerance: float = 1e-3) -> tuple[Denoi
     for skipping in parts_of(model, Skipping):
         skipping.tolerance = tolerance
     return Denoiser(model), Denoiser(model, keep_all=True)
-
-
-# Exactly
 
 
 SHOTS: dict[str, tuple[Callable[[int], Frame], dict[str, float]]] = {
@@ -156,9 +148,6 @@ def test_one_frame_and_the_last_one_are_not_remembered() -> None:
             assert (denoiser._state is not None) is keeps
 
 
-# Pixels without noise
-
-
 def found(frame: Frame) -> Tensor | None:
     return noise_free(frame)
 
@@ -166,7 +155,6 @@ def found(frame: Frame) -> Tensor | None:
 def test_a_clear_sky_has_no_noise_and_is_copied() -> None:
     frame = sky(wall(0), 90)
     free = found(frame)
-    assert free is not None
     assert torch.equal(free, frame.depth == torch.inf)
 
 
@@ -178,21 +166,18 @@ def test_noise_fog_and_detail_are_left_to_the_network() -> None:
     speck = frame.color.clone()
     speck[..., 40, 100] *= 2
     free = found(frame.replace(color=speck))
-    assert free is not None
     assert not free[..., 32:48, 92:112].any()
     assert free[..., :16, :].all()
 
 
 def test_an_emitter_is_copied_and_a_mirror_that_shows_noise_is_not() -> None:
     frame = wall(0)
-    assert frame.albedo is not None
     assert found(frame) is None
     albedo, color = frame.albedo.clone(), frame.color.clone()
     albedo[..., 20:60, 20:60] = 0
     albedo[..., 100:140, 20:60] = 0
     color[..., 20:60, 20:60] = 12.0
     free = found(frame.replace(albedo=albedo, color=color))
-    assert free is not None
     assert free[..., 20:60, 20:60].all()
     assert free.sum() == 40 * 40
     # A black hole may only have met no light yet.
@@ -202,14 +187,10 @@ def test_an_emitter_is_copied_and_a_mirror_that_shows_noise_is_not() -> None:
 
 def test_a_few_pixels_prove_nothing() -> None:
     frame = wall(0)
-    assert frame.depth is not None
     depth = frame.depth.clone()
     depth[..., 50:58, 60:68] = torch.inf
     color = torch.where(depth == torch.inf, 0.5, frame.color)
     assert found(frame.replace(depth=depth, color=color)) is None
-
-
-# Up to a tolerance
 
 
 def relative(a: Tensor, b: Tensor) -> float:
@@ -250,7 +231,6 @@ def edited(number: int, moved: bool) -> Frame:
     frame = wall(0, 0.2)
     if not moved:
         return frame
-    assert frame.albedo is not None
     albedo, color = frame.albedo.clone(), frame.color.clone()
     albedo[..., 10:30, 20:50] = 0.9
     color[..., 10:30, 20:50] = 0.45 + 0.1 * number / 30
@@ -307,13 +287,9 @@ def test_a_cut_and_a_moving_camera_compute_everything_again() -> None:
         denoiser(wall(number, 0.003))
     assert stage(denoiser, "network").skipped == 1
     cut = wall(0, 0.0)
-    assert cut.normal is not None
     denoiser(cut.replace(normal=-cut.normal))
     assert denoiser.report.reset == "cut"
     assert stage(denoiser, "network").skipped == 0
-
-
-# Methods that know nothing of it
 
 
 def shot_of(model: Any, frames: list[Frame], **hints: bool) -> tuple[list[Output], FrameReport]:
@@ -417,7 +393,6 @@ def test_the_state_has_a_batch() -> None:
     model, state = Demodulated(Accumulated(Skipping(Tiled(Blur())))), None
     for frame in both:
         _, state = model(frame, state)
-    assert state is not None
     leaves = [leaf for leaf in pytree.tree_leaves(state) if leaf is not None]
     assert len(leaves) > 6
     assert {len(leaf) for leaf in leaves} == {2}
@@ -425,9 +400,6 @@ def test_the_state_has_a_batch() -> None:
     expected, _ = model(both[-1], state)
     alone, _ = model(frames[-1], taken)
     torch.testing.assert_close(alone.image, expected.image[1:])
-
-
-# The cost of deciding
 
 
 @pytest.mark.slow
@@ -444,9 +416,6 @@ def test_deciding_costs_less_than_a_hundredth_of_the_saved_time() -> None:
         costs.append(short.report.milliseconds["plan"])
         saved.append(whole.report.milliseconds["network"] - short.report.milliseconds["network"])
     assert min(costs) < 0.01 * sorted(saved)[1]
-
-
-# Reports
 
 
 def test_a_summary_counts_fractions_and_tells_why() -> None:

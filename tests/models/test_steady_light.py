@@ -1,7 +1,5 @@
 """Steady light is no firefly: a star in every frame passes, a flash in one does not."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

@@ -1,7 +1,5 @@
 """SVGF: what its accumulation, its variance and its transform promise."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

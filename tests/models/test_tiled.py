@@ -1,7 +1,5 @@
 """Methods in tiles: the images of the whole, within a limit of memory."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
@@ -28,9 +26,6 @@ BUFFERS = frozenset({"color", "albedo", "normal", "depth"})
 CPU = torch.device("cpu")
 
 
-# The same images
-
-
 def test_a_method_may_find_an_alpha_in_tiles() -> None:
     def opaque(frame: Frame, state: Any = None) -> Any:
         return Output(frame.color, alpha=frame.color[:, :1] / 2), None
@@ -38,7 +33,6 @@ def test_a_method_may_find_an_alpha_in_tiles() -> None:
     opaque.needs = Needs(trainable=False, reach=0)  # type: ignore[attr-defined]
     color = torch.rand(1, 3, 70, 80)
     output = Tiled(opaque, side=32)(Frame(color))[0]  # type: ignore[arg-type]
-    assert output.alpha is not None
     assert torch.equal(output.alpha, color[:, :1] / 2)
 
 
@@ -91,9 +85,6 @@ def test_frames_of_more_than_a_million_pixels_are_prepared_by_rows(monkeypatch: 
         for name, image in output.stages.items():
             assert torch.equal(found.stages[name], image), name
         assert by_rows.report.replaced_pixels == (11 * 11 if number == 1 else 0)
-
-
-# Methods that know nothing of it
 
 
 @pytest.mark.parametrize("size", [(96, 160), (99, 131), (20, 30)])
@@ -242,9 +233,6 @@ def test_a_mirror_image_goes_on_for_ever(size: tuple[int, int]) -> None:
     assert np.array_equal(mirrored(image, (16, 21), (3, 40)).numpy(), expected)
 
 
-# Rectangles
-
-
 def test_tiles_hold_every_pixel_once() -> None:
     for region, side in ((Region(0, 0, 237, 331), 96), (Region(64, 32, 65, 4000), 1024), (Region(0, 0, 64, 64), 64)):
         count = torch.zeros(region.bottom, region.right)
@@ -277,9 +265,6 @@ def test_the_whole_image_is_one_tile_where_tiles_would_cost_as_much() -> None:
     assert regions(needed, 8) == [Region(32, 64, 64, 96)]
 
 
-# The choice of tiles
-
-
 @pytest.fixture
 def loaded(monkeypatch: pytest.MonkeyPatch) -> float:
     """Return the memory of a process that has loaded torch and no images, unlike the one that runs tests."""
@@ -297,7 +282,6 @@ def division(of_pixel: int, max_memory: float | None) -> Division:
 def test_the_largest_tiles_that_fit(loaded: float) -> None:
     frames = Frames((4320, 7680), BUFFERS, streaming=False)
     side, reason = division(1000, 4.0).chosen(frames)
-    assert side is not None
     # Twenty channels of float32 are held: ten of the frame, four before the network and six of its results.
     left = 4e9 - loaded - 20 * 4 * 7680 * 4320
     sides = [int(side) + 128 for side in re.findall(r"(\d+)x(\d+) pixels", reason)[0]]

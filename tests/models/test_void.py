@@ -1,7 +1,5 @@
 """Void pixels neither give nor take light, and color and alpha are one pair."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -116,7 +114,6 @@ def test_color_and_alpha_are_one_pair(model: object) -> None:
     red = torch.tensor([0.8, 0.1, 0.05]).reshape(1, 3, 1, 1)
     frame = Frame(cover * red, alpha=cover, layers={"half": cover * red / 2})
     output = Denoiser(model, alpha=True).output(frame)
-    assert output.alpha is not None
     torch.testing.assert_close(output.image, output.alpha * red, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(output.alpha, cover)
     torch.testing.assert_close(output.layers["half"], output.image / 2, rtol=1e-3, atol=1e-5)

@@ -1,7 +1,5 @@
 """Wrappers of any method: demodulation, exposure, another method before it, lower resolutions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -42,8 +40,6 @@ class Staged(Same):
     def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
         return Output(2 * frame.color, {"half": frame.color / 2}), None
 
-
-# All of them
 
 WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "nothing": Wrapper,
@@ -120,14 +116,10 @@ def test_parts_are_found_outermost_first() -> None:
         assert isinstance(part, Model)
 
 
-# Demodulated
-
-
 def test_demodulated_light_contains_no_albedo() -> None:
     watching, frame = Watching(), frame_of(9, 7, variance=torch.rand(1, 3, 9, 7))
     samples = torch.cat([frame.color, torch.ones(1, 2, 9, 7)], 1)[:, None].repeat(1, 3, 1, 1, 1)
     frame = frame.replace(current=frame.color / 2, diffuse=frame.color / 3, specular=frame.color / 4, samples=samples)
-    assert frame.albedo is not None
     output, _ = Demodulated(watching)(frame)
     seen = watching.frames[0]
     assert torch.equal(seen.color, demodulate(frame.color, frame.albedo))
@@ -147,7 +139,6 @@ def test_demodulated_light_contains_no_albedo() -> None:
 
 def test_every_image_of_the_result_is_remodulated() -> None:
     frame = frame_of(9, 7)
-    assert frame.albedo is not None
     output, _ = Demodulated(Staged())(frame)
     light = demodulate(frame.color, frame.albedo)
     torch.testing.assert_close(output.image, remodulate(2 * light, frame.albedo))
@@ -177,9 +168,6 @@ def test_where_there_is_nothing_to_divide_out_nothing_is_done(albedo: float | No
 def test_a_result_of_half_precision_is_remodulated_in_that_of_the_albedo() -> None:
     frame = frame_of(9, 7)
     assert Demodulated(lambda color: color.bfloat16())(frame)[0].image.dtype == torch.float32
-
-
-# Exposed
 
 
 @pytest.mark.parametrize("factor", [1e-3, 7.0, 1e3])
@@ -223,11 +211,7 @@ def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
         torch.testing.assert_close(seen.buffer(name), part * exposure)
     torch.testing.assert_close(seen.samples[:, 0, :3], frame.color * exposure)
     assert torch.equal(seen.samples[:, 0, 3:], torch.ones(1, 2, 20, 24))
-    assert seen.skip is not None
     torch.testing.assert_close(seen.skip.image, 3 * frame.color * exposure)
-
-
-# Chain
 
 
 def test_each_method_sees_the_image_of_the_one_before() -> None:

@@ -1,7 +1,5 @@
 """WSKP and its U-Net against their equations, written out in float64, and the merging of branches."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F

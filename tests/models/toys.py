@@ -1,7 +1,5 @@
 """Methods of ten lines that know nothing of their wrappers, and frames for them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -201,6 +199,4 @@ class Shot:
             with ops.use(self.backend, strict=False):
                 output, self.state = self.model(frame, self.state)
         seen = self.watching.frames[-1]
-        assert seen.current is not None
-        assert seen.length is not None
         return Seen(seen.color, seen.current, seen.length, report_of(output).reset)

@@ -60,5 +60,4 @@ def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
     leaf = image.clone().requires_grad_()
     weights = torch.randn_like(forward)
     (unet(leaf)[0] * weights).sum().backward()
-    assert leaf.grad is not None
     torch.testing.assert_close((forward * weights).sum(), (leaf.grad * direction).sum())

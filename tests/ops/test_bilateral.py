@@ -43,7 +43,6 @@ def test_guides_of_other_dtypes() -> None:
     weights = cross_bilateral_weights(logits, [guide, guide.half()], [scale.float(), scale.bfloat16()])
     weights.square().sum().backward()
     assert weights.dtype == torch.float32
-    assert guide.grad is not None
     assert guide.grad.dtype == torch.float64
 
 

@@ -110,7 +110,6 @@ def passed(
                 past = position if frame.previous_position is None or position is None else frame.previous_position
                 if motion is None and past is not None and not still:
                     camera = frames[number - 1].view_projection
-                    assert camera is not None
                     motion = motion_from_position(past, camera)
                 history, length, kept = steps.blend(
                     *(entering, history, length, motion, Surface(past, frame.normal, depth, seen), before),

@@ -132,8 +132,6 @@ def affinity_filter(
     frames: list[tuple[Image, Image, Image, Image | None]]
     frames = [(image.tolist(), features.tolist(), bandwidth.tolist(), None)]
     if previous is not None and previous_features is not None:
-        assert previous_bandwidth is not None
-        assert previous_weight is not None
         of_before = previous_bandwidth.tolist(), previous_weight.tolist()
         frames.append((previous.tolist(), previous_features.tolist(), *of_before))
     here, own, out = features.tolist(), center.tolist(), zeros(image.shape)

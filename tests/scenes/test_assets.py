@@ -1,7 +1,5 @@
 """Assets: archives that hold anything, and models as they come out of them."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

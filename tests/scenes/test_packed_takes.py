@@ -1,7 +1,5 @@
 """Takes: what a number draws, where samples lie, what frames of a known scene hold, and training on the files."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

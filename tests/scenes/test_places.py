@@ -1,7 +1,5 @@
 """Places of takes: the same again for the same seed, fit to be rendered, and seen from free space."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import subprocess
@@ -67,9 +65,6 @@ def entries(value: Any) -> Iterator[dict[str, Any]]:
             yield from entries(item)
 
 
-# The same again
-
-
 def test_the_same_seed_is_the_same_scene_in_any_process_without_mitsuba() -> None:
     seeds = [0, 1, 2]
     here = [digest(seed) for seed in seeds]
@@ -93,9 +88,6 @@ def test_a_longer_shot_begins_like_a_shorter_one() -> None:
         assert short.moves.keys() == long.moves.keys()
         for name, moved in short.moves.items():
             np.testing.assert_array_equal(moved, long.moves[name][:5])
-
-
-# Contents of the scenes
 
 
 def test_moves_are_rigid_and_of_objects_in_the_scene() -> None:
@@ -141,9 +133,6 @@ def test_every_light_shines() -> None:
             assert values.max() > 0
 
 
-# Cameras
-
-
 def test_cameras_are_outside_the_boxes_of_all_shapes() -> None:
     for seed, made in zip(SEEDS, survey(), strict=True):
         shapes = {name: shape for name, shape in made.scene.items() if "to_world" in shape and "bsdf" in shape}
@@ -151,9 +140,6 @@ def test_cameras_are_outside_the_boxes_of_all_shapes() -> None:
         for camera in made.cameras:
             eye = camera.to_world[:3, 3]
             assert not ((eye > boxes[:, 0] - CLOSE) & (eye < boxes[:, 1] + CLOSE)).all(axis=-1).any(), seed
-
-
-# The scenes in Mitsuba
 
 
 def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:

@@ -33,17 +33,11 @@ BLENDER = os.environ.get("BLENDER_PYTHON")
 TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
 
 
-# Rows
-
-
 def test_rows_are_chosen_by_patterns() -> None:
     names = [row.name for row in choose_rows("cycles-gallery-4*, mitsuba-parlour-lens-4")]
     assert names == ["cycles-gallery-4", "cycles-gallery-4-still", "mitsuba-parlour-lens-4"]
     with pytest.raises(InputError, match=r"--rows: .*'gallery'"):
         choose_rows("cycles-*,gallery")
-
-
-# Rendering
 
 
 @pytest.fixture
@@ -125,9 +119,6 @@ def test_a_reference_is_the_mean_of_its_parts_with_an_estimate_of_its_noise(tmp_
     assert noise == pytest.approx(0.1 / 8**0.5 * (2 / np.pi) ** 0.5 / 2.01, rel=0.05)
 
 
-# Tables
-
-
 def _results(ours: list[float], fast: list[float], high: list[float]) -> tuple[Results, list[Row]]:
     """SMAPE of a model and of two settings of OIDN on rows ``a``, ``b``, ...; PSNR is 100 times its complement."""
     rows = [
@@ -204,9 +195,6 @@ def test_close_ups_are_drawn_side_by_side(tmp_path: Path) -> None:
     noisy, ours, reference = (pixels[56:, left : left + width] for left in range(0, pixels.shape[1], width + 4))
     np.testing.assert_array_equal(ours, reference)
     assert noisy.min() > reference.max()
-
-
-# The command
 
 
 def test_the_command_scores_the_existing_rows(

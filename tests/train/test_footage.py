@@ -51,7 +51,6 @@ def noisy_features(noisy: Path) -> Path:
             torch.manual_seed(100 * noise_seed + number)
             folder = inputs / f"noise_seed{noise_seed}"
             write_buffer(folder, number, "albedo", 0.2 + 0.7 * torch.rand(1, 3, 20, 24))
-            assert position is not None
             write_buffer(folder, number, "position", position + 0.01 * torch.rand(1, 3, 20, 24))
     return noisy
 
@@ -181,8 +180,6 @@ def test_features_with_noise_are_those_of_the_noise_seed(noisy_features: Path, t
                     assert torch.equal(clip[name][i], dict(frame.items())[name][0])
                 if first + i > 0:
                     camera = sequence.frame(first + i - 1).view_projection
-                    assert frame.position is not None
-                    assert camera is not None
                     moved = motion_from_position(frame.position, camera)
                     assert torch.equal(clip["motion"][i], moved[0])
     differ = [not torch.equal(whole.read()[name], whole.read(noise_seed=1)[name]) for name in names]
@@ -288,8 +285,6 @@ def test_links_to_nothing_and_names_that_are_no_text_are_no_part_of_a_sequence(n
             Path(os.fsdecode(os.fsencode(folder) + b"/M\xfcller" + suffix.encode())).touch()
     assert digest(noisy, tmp_path / "other") == first
 
-
-# Packed takes: the history of all frames is in those that are kept, and stills give clips, too.
 
 SIZE = (12, 20)
 ALBEDO = frozenset({"albedo"})

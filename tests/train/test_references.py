@@ -1,7 +1,5 @@
 """Clean references: noise goes, and what a denoiser would take away with it stays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

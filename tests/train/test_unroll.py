@@ -28,9 +28,6 @@ def clip_of(frames: int = 3, size: tuple[int, int] = (6, 7), dtype: torch.dtype 
     return Clip({"color": color, "motion": motion, "reference": torch.rand_like(color)})
 
 
-# The unroll
-
-
 def test_the_state_goes_from_frame_to_frame() -> None:
     model, clip = Recurrent(), clip_of(4)
     output = unroll(model, clip)
@@ -64,9 +61,6 @@ def test_the_gradient_through_time() -> None:
     assert (through_time[:, 0] != 0).any()
 
 
-# A recurrent method of one's own
-
-
 def trained(model: str, sequence: Path, out: Path, **changes: Any) -> tuple[Path, list[float]]:
     """The weights of a short run, and its losses."""
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
@@ -93,9 +87,6 @@ def test_a_recurrent_method_learns(small_sequence: Path, tmp_path: Path, factory
     # Every weight has learnt through time: those of the gates see the state alone.
     fresh, learnt = (dict(model.named_parameters()) for model in (plain(), create_model(f"{MINE}:plain", weights=path)))
     assert all(not torch.equal(learnt[name], weight) for name, weight in fresh.items())
-
-
-# Modules of one's own
 
 
 def test_a_module_of_four_buffers_learns_and_denoises(small_sequence: Path, tmp_path: Path) -> None:

@@ -20,8 +20,6 @@ def rendered() -> Path:
 def others(rendered: Path) -> Any:
     """The script that writes files with the channel names of renderers which did not run here."""
     spec = importlib.util.spec_from_file_location("others", rendered / "others.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -94,9 +94,6 @@ def test_no_camera_is_found_from_points_of_one_plane() -> None:
     assert fit_camera(floor.astype(np.float32).astype(np.float64), down) is None
 
 
-# Real renderers
-
-
 @pytest.mark.parametrize("number", [1, 4])
 def test_the_camera_of_blender(number: int, rendered: Path, others: Any) -> None:
     channels = {0: [f"ViewLayer.{each}" for each in ("Position.X", "Position.Y", "Position.Z", "Depth.Z")]}
@@ -112,9 +109,6 @@ def test_the_camera_of_blender(number: int, rendered: Path, others: Any) -> None
         60 / 36, rel=1e-4
     )
     assert found.error < 1e-4
-
-
-# Conventions
 
 
 @pytest.mark.parametrize("convention", ["", "y up", "transposed", "transposed, y up"])

@@ -91,9 +91,6 @@ def test_the_names_of_every_renderer(renderer: str, channels: str, layer: str, b
     assert sum(len(each.channels) for each in layers) >= len(channels.split())
 
 
-# The user's mapping
-
-
 @pytest.fixture
 def layered(tmp_path: Path) -> Path:
     """A still with two layers of color in one view, a normal of another name, and a depth."""

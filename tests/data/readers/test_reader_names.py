@@ -36,9 +36,6 @@ def image(tmp_path: Path) -> Callable[..., list[Path]]:
     return written
 
 
-# The digits that count
-
-
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
@@ -80,9 +77,6 @@ def test_which_digits_count_the_frames(names: list[str], expected: dict[str, lis
 def test_two_files_of_a_frame_are_refused() -> None:
     message = refused(group_files, [D / "shot_0001.exr", D / "shot_1.exr"])
     assert "shot_1.exr: expected one file a frame, found shot_0001.exr as well" in message
-
-
-# Inputs of the user
 
 
 @pytest.mark.parametrize(
@@ -143,9 +137,6 @@ def test_paths_and_patterns_without_files(
         (folder / "dangling.exr").symlink_to(tmp_path / "gone.exr")
     message = refused(open_sequence, [tmp_path / each for each in given])
     assert expected in message
-
-
-# Shots
 
 
 def test_two_shots_are_refused_with_the_option_that_decides(image: Callable[..., list[Path]], tmp_path: Path) -> None:

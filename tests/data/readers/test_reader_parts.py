@@ -60,7 +60,6 @@ def blender(*without: str) -> tuple[dict[str, Image], dict[str, Image]]:
 
 def image_of(frame: Frame, buffer: str) -> Image:
     found = frame.buffer(buffer)
-    assert found is not None
     return found[0].permute(1, 2, 0).numpy()
 
 
@@ -151,9 +150,6 @@ def test_kpcn_filters_both_parts_of_a_real_file(rendered: Path, tmp_path: Path, 
     assert status == 0
     said = "kept (diffuse and specular light)" if split else "skipped (these weights are for color alone)"
     assert f"  specular branch: {said}\n" in printed
-
-
-# Layers that add up, chosen from their values
 
 
 def shares(count: int, seed: int = 0) -> list[Any]:

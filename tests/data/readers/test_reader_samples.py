@@ -44,7 +44,6 @@ def test_layers_beside_the_color(tmp_path: Path, kind: str) -> None:
     assert "samples" in sequence.buffers
     assert not sequence.warnings
     frame = sequence.frame(1)
-    assert frame.samples is not None
     np.testing.assert_allclose(frame.samples[0], samples, rtol=2.0**-11 if kind == "half" else 0)
     assert sequence.frame(1, buffers={"albedo"}).samples is None
 
@@ -62,7 +61,6 @@ def test_a_file_of_their_own_comes_back(tmp_path: Path, channels: int, layout: s
     sequence = open_sequence(tmp_path)
     assert (sequence.layout, sequence.unused, sequence.warnings) == (layout, [], [])
     frame = sequence.frame(4)
-    assert frame.samples is not None
     np.testing.assert_allclose(frame.samples[0], samples, rtol=2.0**-11, atol=2.0**-25)
     assert sequence.frame(4, buffers=()).samples is None
 

@@ -140,9 +140,6 @@ def test_the_data_of_renderers_with_and_without_albedo(
         assert open_sequence(path, color_has_albedo=divided).color_has_albedo is divided
 
 
-# Normals
-
-
 def directions(seed: int) -> Image:
     vectors = np.random.default_rng(seed).standard_normal((40, 50, 3))
     return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
@@ -176,9 +173,6 @@ def test_normals_that_all_point_to_one_side() -> None:
     assert not is_direction(np.zeros((8, 8, 3), np.float32))
 
 
-# Depth
-
-
 @pytest.mark.parametrize("background", [0.0, -1.0, 65504.0, 1e10, 1e30, 3.4e38, np.inf, -np.inf, np.nan])
 def test_every_background_of_depth_is_infinity(background: float, tmp_path: Path) -> None:
     depth = np.full((12, 16), 7.5, np.float32)
@@ -193,9 +187,6 @@ def test_every_background_of_depth_is_infinity(background: float, tmp_path: Path
     np.testing.assert_array_equal(frame.depth[0, 0, 4:].numpy(), depth[4:])
     (row,) = [row for row in sequence.table if row.buffer == "depth"]
     assert "background: 33%" in row.reading
-
-
-# Motion
 
 
 def moving(shift: tuple[float, float], size: tuple[int, int] = (60, 100)) -> tuple[dict[str, Image], dict[str, Image]]:

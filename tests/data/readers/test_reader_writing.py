@@ -226,9 +226,6 @@ def test_attributes_of_several_parts_stay(rendered: Path, tmp_path: Path) -> Non
     assert found == {(each.part, each.name): content[each.start : each.end] for each in records(content)}
 
 
-# Pictures that hold one image
-
-
 @pytest.mark.parametrize("scale", [b"-1.0", b"1.0"])
 def test_a_pfm_begins_with_its_last_row(scale: bytes, tmp_path: Path) -> None:
     source, image = tmp_path / "render.pfm", noise(*SIZE, 3)
@@ -244,9 +241,6 @@ def test_a_pfm_begins_with_its_last_row(scale: bytes, tmp_path: Path) -> None:
     order = "<f4" if written.splitlines()[2].startswith(b"-") else ">f4"
     found = np.frombuffer(written[-other.nbytes :], order).reshape(*SIZE, 3)
     np.testing.assert_array_equal(found[::-1], other)
-
-
-# Files that cannot be written
 
 
 def test_the_input_folder_is_no_output(rendered: Path, tmp_path: Path) -> None:
