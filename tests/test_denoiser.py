@@ -25,8 +25,6 @@ def frames(small_sequence: Path) -> list[Frame]:
 
 
 class Keep(nn.Module):
-    """A network that changes nothing, and remembers what it saw."""
-
     def forward(
         self, color: Tensor, albedo: Tensor | None = None, normal: Tensor | None = None, depth: Tensor | None = None
     ) -> Output:
@@ -35,8 +33,6 @@ class Keep(nn.Module):
 
 
 class Mean(nn.Module):
-    """The mean of all frames of a shot, and what it was handed as its state."""
-
     needs = Needs(trainable=False)
 
     def __init__(self) -> None:
@@ -131,14 +127,6 @@ def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: 
     assert torch.equal(denoiser(frames[1]), after)
 
 
-def test_a_change_of_size_starts_a_new_shot(frames: list[Frame]) -> None:
-    denoiser = Denoiser(small_model())
-    denoiser(frames[0])
-    image = denoiser(Frame(color=torch.rand(1, 3, 11, 13)))
-    assert image.shape == (1, 3, 11, 13)
-    assert denoiser.report.reset == "size change"
-
-
 @pytest.mark.parametrize("device", ["nowhere", "meta", "hpu", "cuda:99"])
 def test_a_device_that_is_not_there(device: str) -> None:
     assert f"device '{device}': expected one that torch can use" in refused(lambda: Denoiser(Keep(), device=device))
@@ -222,11 +210,17 @@ BAD: dict[str, tuple[Callable[[Frame, Any], Any], str]] = {
     "shape": (lambda frame, state: (Output(frame.color[..., 1:]), None), "found an image of (1, 3, 9, 6)"),
     "channels": (lambda frame, state: (Output(frame.color[:, :1]), None), "found an image of (1, 1, 9, 7)"),
     "no image": (lambda frame, state: (Output(None), None), "found Output"),
+    "integers": (lambda frame, state: (Output(frame.color.long()), None), "found torch.int64"),
+    "elsewhere": (lambda frame, state: (Output(frame.color.to("meta")), None), "on cpu, found one on meta"),
     "no output": (lambda frame, state: (frame.color, None), "found Tensor"),
     "nan": (lambda frame, state: (Output(frame.color * torch.nan), None), "NaN or infinite pixels"),
     "infinite": (lambda frame, state: (Output(frame.color / 0), None), "NaN or infinite pixels"),
     "state of text": (lambda frame, state: (Output(frame.color), "state"), "found str"),
     "state of numbers": (lambda frame, state: (Output(frame.color), {"count": 1}), "found int"),
+    "state elsewhere": (
+        lambda frame, state: (Output(frame.color), {**state, "total": frame.color.to("meta")}),
+        "expected a state on cpu, found meta",
+    ),
 }
 
 

@@ -10,10 +10,9 @@ import pytest
 import torch
 from commands import succeeds
 from planes import leaning_wall
-from refusals import refused
 from torch import Tensor
 
-from mcdenoise import Denoiser, Frame, create_model, ops
+from mcdenoise import Denoiser, Frame, ops
 from mcdenoise.data import read_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 
@@ -119,23 +118,6 @@ def test_an_image_is_an_ordinary_tensor_whatever_the_model_and_the_frame_are(mod
             torch.testing.assert_close(scale.grad, image.mean())
 
 
-def test_one_absurdly_bright_pixel_is_replaced_and_counted(shot: list[Frame]) -> None:
-    window = shot[1].color[0, :, 9:12, 19:22].reshape(3, 9)
-
-    def with_pixel(value: Tensor | float) -> list[Frame]:
-        color = shot[1].color.clone()
-        color[0, :, 10, 20] = value
-        return [shot[0], shot[1].replace(color=color), *shot[2:]]
-
-    expected = denoised(with_pixel(window[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(1)))
-    for value in (3.4e38, 1.1e16):
-        broken = with_pixel(value)
-        denoiser = Denoiser(MODEL)
-        for number, (frame, image) in enumerate(zip(broken, expected, strict=True)):
-            torch.testing.assert_close(denoiser(frame), image)
-            assert denoiser.report.replaced_pixels == (number == 1), value
-
-
 @pytest.mark.parametrize(
     ("name", "albedo", "where"),
     [("moving", None, slice(10, 11)), ("still", 0.0, slice(None)), ("motion vectors", 1e-3, slice(10, 20))],
@@ -152,19 +134,6 @@ def test_the_largest_radiance_that_is_one_stays_finite(name: str, where: slice, 
         for image in (*output.stages.values(), output.image):
             assert image.isfinite().all()
             assert image.max() <= 1.01e16
-
-
-@pytest.mark.parametrize("name", ["moving", "still"])
-def test_images_that_are_not_finite_are_neither_returned_nor_remembered(name: str) -> None:
-    shot = [SHOTS[name](number) for number in range(FRAMES)]
-    expected, model = denoised(shot), create_model(MODEL, pretrained=True)
-    denoiser, weight = Denoiser(model), [*model.parameters()][-1].data.view(-1)[:1]
-    for frame, image in zip(shot, expected, strict=True):
-        right = weight.clone()
-        weight.fill_(torch.nan)
-        assert "expected finite radiance, found" in refused(lambda frame=frame: denoiser(frame))
-        weight.copy_(right)
-        assert torch.equal(denoiser(frame), image)
 
 
 def run(sequence: Path, out: Path, frames: str) -> tuple[np.ndarray, str]:

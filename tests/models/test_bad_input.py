@@ -40,7 +40,6 @@ def model_of(name: str) -> Any:
 
 @functools.cache
 def state_of(name: str, batch: int = 1) -> Any:
-    """Return the state of a method after two frames."""
     model, state = model_of(name), None
     with torch.no_grad():
         for seed in range(2):
@@ -168,7 +167,6 @@ def altered(state: Any, change: Any) -> Any:
 @torch.no_grad()
 @pytest.mark.parametrize("name", KEEPING)
 def test_a_state_of_another_batch_device_or_precision_is_refused(name: str) -> None:
-    """Both are named."""
     model = model_of(name)
     frame, state = whole_frame(model, HEIGHT, WIDE, seed=5), state_of(name)
     message = refused(lambda: model(frame, state_of(name, 2)))

@@ -77,14 +77,6 @@ def test_light_that_is_a_function_of_the_features_is_reproduced() -> None:
             torch.testing.assert_close(denoiser(given.replace(color=light)), light, rtol=1e-4, atol=0)
 
 
-def test_noise_falls_in_space_and_in_time() -> None:
-    """A fit of 10 functions to blocks of 1024 pixels leaves about 10 / 1024 of the variance of a frame."""
-    denoiser = Denoiser("bmfr")
-    errors = [(denoiser(frame(seed=seed)) - 1).square().mean().item() for seed in range(8)]
-    assert errors[0] < 3 * 10 / 1024
-    assert errors[-1] < errors[0] / 2
-
-
 def naive(new: list[list[list[float]]], before: list[list[list[float]]], alpha: float) -> Tensor:
     """``taa`` of the public code, for a scene at rest, of gamma-mapped values ``[row][column][channel]``."""
 

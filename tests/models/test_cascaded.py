@@ -43,7 +43,6 @@ def fused(network: Any, images: list[Tensor]) -> Tensor:
 
 
 def features(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-    """Albedo, normal and depth in the range from 0 to 1."""
     depth = frame.depth
     hit = torch.isfinite(depth)
     typical = torch.exp(torch.log(depth[hit]).mean())
@@ -52,7 +51,6 @@ def features(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def predictions(network: Any, frame: Frame) -> list[Tensor]:
-    """Return the predictions of the heads, from the ten channels that the paper names."""
     levels = network.unet(torch.cat([frame.color, *features(frame)], 1))
     return [
         F.conv2d(level, head.weight, head.bias, padding=1) for level, head in zip(levels, network.heads, strict=True)
@@ -141,27 +139,6 @@ def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:
     assert torch.isfinite(output.image).all()
     assert (output.image >= 0).all()
     assert not torch.equal(output.image, frame.color)
-
-
-def test_without_bilateral_weights_features_matter_to_the_u_net_alone() -> None:
-    """If the U-Net is blind, normals change the filtered image with the weights, and not without them."""
-    frame = frame_of(*SIZE).to(torch.float64)
-    other = frame.replace(normal=frame.normal.flip(3))
-    for bilateral, same in ((True, False), (False, True)):
-        network = drawn(KernelNetwork(8, bilateral=bilateral))
-        nn.init.zeros_(network.unet.encoder[0][0].weight)
-        assert torch.equal(network(frame)[0].image, network(other)[0].image) is same
-
-
-def test_kernels_keep_a_constant_image() -> None:
-    """Weights have the sum 1, and Eq. 2 returns what both scales agree on."""
-    for bilateral in (True, False):
-        network = drawn(KernelNetwork(8, bilateral=bilateral))
-        frame = frame_of(13, 18).to(torch.float64)
-        frame = frame.replace(color=torch.full_like(frame.color, 0.7))
-        torch.testing.assert_close(network(frame)[0].image, frame.color, rtol=0, atol=1e-12)
-    network = drawn(KernelNetwork(8, normalize="none"))
-    assert not torch.allclose(network(frame)[0].image, frame.color, rtol=0.1)
 
 
 @torch.no_grad()

@@ -106,8 +106,6 @@ def test_a_step_runs_without_any_values(name: str) -> None:
 
 
 class Curious(nn.Module):
-    """Reads values in all the ways that there are."""
-
     needs = Same.needs
 
     def __init__(self, way: str) -> None:
@@ -253,8 +251,6 @@ class Event:
 
 
 class Behind(Stopwatch):
-    """The stopwatch of that device."""
-
     @property
     def runs_behind(self) -> bool:
         return True

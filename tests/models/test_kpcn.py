@@ -16,7 +16,6 @@ from mcdenoise.ops import luminance_moments, moments_variance
 
 
 def parts(height: int, width: int, **changes: Any) -> Frame:
-    """A frame with its light in parts, in float64."""
     generator = torch.Generator().manual_seed(5)
     light = {name: 3 * torch.rand(1, 3, height, width, generator=generator) for name in ("diffuse", "specular")}
     return frame_of(height, width, **light).to(torch.float64).replace(**changes)

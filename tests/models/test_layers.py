@@ -321,8 +321,6 @@ def test_a_method_without_kernels_is_split_by_filtered_proportions() -> None:
 
 
 class Ones(nn.Module):
-    """A clean image, and nothing of its layers."""
-
     needs = Needs(trainable=False)
 
     def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
@@ -330,8 +328,6 @@ class Ones(nn.Module):
 
 
 class Layered(nn.Module):
-    """Answers with layers of its own."""
-
     needs = Needs(trainable=False)
 
     def __init__(self, **layers: Any) -> None:

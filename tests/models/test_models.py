@@ -57,7 +57,6 @@ TRAINABLE = [name for name in KINDS if trainable(name)]
 
 
 def tensors(tree: Any) -> list[Tensor]:
-    """The tensors of a state."""
     return [leaf for leaf in pytree.tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 

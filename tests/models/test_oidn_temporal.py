@@ -24,15 +24,7 @@ from mcdenoise.models.oidn_temporal import mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.steadied import Steadied
 from mcdenoise.models.tiled import MIRRORED
-from mcdenoise.models.with_oidn import (
-    CENTRED,
-    NOISY,
-    OIDN,
-    OIDN_ALBEDO,
-    OIDN_CLEAN,
-    WithOidn,
-    _without_pattern,
-)
+from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn, _without_pattern
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._steps.transfer import compress
 from mcdenoise.ops._window import mirrored

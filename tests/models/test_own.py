@@ -3,7 +3,6 @@
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -123,66 +122,6 @@ def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
 
 def test_settings_are_those_of_the_factory(mine: Path) -> None:
     assert "it takes channels" in refused(lambda: create_model(f"{mine}:network", width=3))
-
-
-def test_a_buffer_that_the_frames_have_not(mine: Path) -> None:
-    assert re.match(r"buffer 'albedo': .*color", refused(lambda: Denoiser(f"{mine}:network")(frame())))
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda color: color[..., :-1], r"expected an Output with an image of \(1, 3, 24, 32\), found an image of"),
-        (lambda color: color[:, :1], r"found an image of \(1, 1, 24, 32\)"),
-        (lambda color: color * torch.nan, "NaN or infinite"),
-        (lambda color: color / 0, "NaN or infinite"),
-        (lambda color: [color], r"expected a model .* <lambda> returned list"),
-        (lambda color: color.long(), r"expected a floating-point image, found torch\.int64"),
-        (lambda color: color.to("meta"), "expected an image on cpu, found one on meta"),
-    ],
-)
-def test_an_invalid_image_is_refused_in_one_line(function: Any, message: str) -> None:
-    assert re.search(message, refused(lambda: Denoiser(function)(frame())))
-
-
-class Misbehaving(Mean):
-    """The mean of all frames, where it does not misbehave in the second."""
-
-    misbehave = ""
-
-    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        output, after = super().forward(frame, state)
-        wrong = {
-            "structure": tuple(after.values()),
-            "kind": {**after, "count": 3},
-            "device": {**after, "total": after["total"].to("meta")},
-        }
-        return output, after if state is None else wrong.get(self.misbehave, after)
-
-
-def test_a_state_is_carried_from_frame_to_frame() -> None:
-    denoiser, frames = Denoiser(Mean()), [frame() for _ in range(3)]
-    images = [denoiser(each) for each in frames]
-    torch.testing.assert_close(images[-1], torch.stack([each.color for each in frames]).mean(0))
-
-
-@pytest.mark.parametrize(
-    ("misbehave", "message"),
-    [
-        ("structure", "expected a state of the same structure as for the frame before, found another"),
-        ("kind", "expected a state of tensors, found int in it"),
-        ("device", "expected a state on cpu, found meta in it"),
-    ],
-)
-def test_an_invalid_state_is_refused_and_the_last_one_kept(misbehave: str, message: str) -> None:
-    model = Misbehaving()
-    model.misbehave = misbehave
-    denoiser, frames = Denoiser(model), [frame() for _ in range(2)]
-    denoiser(frames[0])
-    assert message in refused(lambda: denoiser(frames[1]))
-    # The state is still that of the first frame.
-    model.misbehave = ""
-    torch.testing.assert_close(denoiser(frames[1]), (frames[0].color + frames[1].color) / 2)
 
 
 def test_a_state_of_another_size_is_refused_in_one_line_where_the_model_minds() -> None:

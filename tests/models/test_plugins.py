@@ -42,7 +42,6 @@ BROKEN = {
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of installed packages; each offers one model."""
     for name, (source, _) in BROKEN.items():
         (tmp_path / f"package_that_{name}.py").write_text(source)
         install(tmp_path, f"that_{name}", f"[mcdenoise.models]\n{name} = package_that_{name}:make\n")

@@ -105,19 +105,6 @@ def test_exact_skipping_changes_no_pixel(precision: Any, shot: str) -> None:
     assert names <= {"noise-free pixels"} | absent
 
 
-def test_the_network_does_not_run_on_the_sky() -> None:
-    size = (320, 224)
-    short, whole = pair()
-    frame = sky(wall(0, size=size), 200)
-    image, expected = short(frame), whole(frame)
-    # Convolutions choose the order of their sums by the size of the image and the number of threads.
-    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-5 * float(expected.mean()))
-    # Down from row 192, a multiple of 32, and 64 rows above it that the network looks at.
-    assert stage(short, "network").skipped == pytest.approx(192 / 320)
-    assert stage(whole, "network").skipped == 0
-    assert torch.equal(short(frame)[..., :200, :], frame.color[..., :200, :])
-
-
 def test_a_method_of_unknown_reach_runs_and_known_pixels_are_kept() -> None:
     class Half(nn.Module):
         calls = 0
@@ -148,13 +135,9 @@ def test_one_frame_and_the_last_one_are_not_remembered() -> None:
             assert (denoiser._state is not None) is keeps
 
 
-def found(frame: Frame) -> Tensor | None:
-    return noise_free(frame)
-
-
 def test_a_clear_sky_has_no_noise_and_is_copied() -> None:
     frame = sky(wall(0), 90)
-    free = found(frame)
+    free = noise_free(frame)
     assert torch.equal(free, frame.depth == torch.inf)
 
 
@@ -162,27 +145,27 @@ def test_noise_fog_and_detail_are_left_to_the_network() -> None:
     frame = sky(wall(0), 90)
     for strength in (0.05, 1.0):
         noisy = frame.color * (1 + strength * (draw(7) - 0.5))
-        assert found(frame.replace(color=noisy)) is None
+        assert noise_free(frame.replace(color=noisy)) is None
     speck = frame.color.clone()
     speck[..., 40, 100] *= 2
-    free = found(frame.replace(color=speck))
+    free = noise_free(frame.replace(color=speck))
     assert not free[..., 32:48, 92:112].any()
     assert free[..., :16, :].all()
 
 
 def test_an_emitter_is_copied_and_a_mirror_that_shows_noise_is_not() -> None:
     frame = wall(0)
-    assert found(frame) is None
+    assert noise_free(frame) is None
     albedo, color = frame.albedo.clone(), frame.color.clone()
     albedo[..., 20:60, 20:60] = 0
     albedo[..., 100:140, 20:60] = 0
     color[..., 20:60, 20:60] = 12.0
-    free = found(frame.replace(albedo=albedo, color=color))
+    free = noise_free(frame.replace(albedo=albedo, color=color))
     assert free[..., 20:60, 20:60].all()
     assert free.sum() == 40 * 40
     # A black hole may only have met no light yet.
     color[..., 20:60, 20:60] = 0
-    assert found(frame.replace(albedo=albedo, color=color)) is None
+    assert noise_free(frame.replace(albedo=albedo, color=color)) is None
 
 
 def test_a_few_pixels_prove_nothing() -> None:
@@ -190,7 +173,7 @@ def test_a_few_pixels_prove_nothing() -> None:
     depth = frame.depth.clone()
     depth[..., 50:58, 60:68] = torch.inf
     color = torch.where(depth == torch.inf, 0.5, frame.color)
-    assert found(frame.replace(depth=depth, color=color)) is None
+    assert noise_free(frame.replace(depth=depth, color=color)) is None
 
 
 def relative(a: Tensor, b: Tensor) -> float:

@@ -33,15 +33,6 @@ def kept(state: Past) -> tuple[Tensor, ...]:
     return state.image.split([3, 2, 1], 1)
 
 
-def test_noise_falls_in_space_and_in_time() -> None:
-    """The first frame is smoother than accumulation alone is after as many as its weight allows: nine."""
-    denoiser = Denoiser("svgf")
-    variances = [denoiser(frame(seed=seed)).var().item() for seed in range(8)]
-    assert variances[0] < 1 / 9
-    assert variances[-1] < variances[0] / 2
-    assert denoiser.report.reset == ""
-
-
 def test_the_weight_of_a_frame_is_one_over_their_number_down_to_alpha() -> None:
     """Moments are not filtered: those of n frames, of which the first is lit, have alpha times its own."""
     model, state, rest = Svgf(alpha=0.2), None, 1.0

@@ -17,7 +17,6 @@ from mcdenoise.ops._backend import Backend
 
 
 def report_of(output: Output) -> FrameReport:
-    """What the notes of a step tell."""
     report = FrameReport()
     report.add(output.notes)
     return report
@@ -111,8 +110,6 @@ def drawn(network: nn.Module, std: float = 0.15) -> Any:
 
 
 class Same(nn.Module):
-    """Changes nothing."""
-
     needs = Needs(trainable=False, reach=0)
 
     def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
