@@ -33,13 +33,7 @@ _LEFTOVER = re.compile(r"\.mcdenoise-|\.tmp|\.copy\.exr|/building")
 
 
 class Attacker:
-    """Runs cases and counts them.
-
-    Args:
-        server: the server that runs the commands.
-        base: folder for all files.
-        counts: numbers of cases and of failed cases, by group.
-    """
+    """Runs cases in folders of ``base``, and counts them and those that failed, by group."""
 
     def __init__(self, server: Server, base: Path, counts: Counter[tuple[str, str]]) -> None:
         self.server, self.base, self.counts = server, base, counts
@@ -55,7 +49,6 @@ class Attacker:
         self.intact = {path: path.read_bytes() for path in sorted(self.world.rglob("*")) if path.is_file()}
 
     def run(self, command: list[str], folder: Path, **options: Any) -> Ended:
-        """Run one command."""
         (ended,) = self.server.run(Process(command, str(folder), **options))
         return ended
 
@@ -78,7 +71,7 @@ class Attacker:
             command = COMMANDS[name]
             folder = self.fresh(command.needs)
             ended = self.run(command.command, folder, seconds=command.seconds)
-            problem = _of_lines(command, ended)
+            problem = of_lines(command, ended)
             assert ended.status == 0, (name, ended)
             assert not problem, (name, problem)
             assert "warning: " not in ended.err, (name, ended)
@@ -134,18 +127,12 @@ class Attacker:
         besides: str = "",
         needed: bool = False,
     ) -> str:
-        """The problem of a case, or an empty string.
+        """The problem of a case, or an empty string: the result is ``same`` as of intact files, or there is a warning.
 
-        Args:
-            name: name of the command.
-            folder: folder in which it ran.
-            ended: how it ended.
-            same: whether the result must be that of intact files, unless the command warns.
-            besides: the file that was damaged.
-            needed: whether the command must succeed.
+        The file ``besides`` was damaged; where the command is ``needed``, it must succeed.
         """
         command, (result, after) = COMMANDS[name], self.expected(name)
-        problem = _of_lines(command, ended)
+        problem = of_lines(command, ended)
         if problem:
             return problem
         if needed and ended.status != 0:
@@ -181,13 +168,8 @@ class Attacker:
                 return f"{place} was changed"
         return ""
 
-    def lines(self, name: str, ended: Ended) -> str:
-        """The problem with the exit status and the output of a command, or an empty string."""
-        return _of_lines(COMMANDS[name], ended)
-
 
 def is_installed(module: str) -> bool:
-    """Whether a module that a command requires is installed."""
     return not module or importlib.util.find_spec(module) is not None
 
 
@@ -215,7 +197,7 @@ def unreadable(out: Path, besides: str = "") -> str:
     return ""
 
 
-def _of_lines(command: Command, ended: Ended) -> str:
+def of_lines(command: Command, ended: Ended) -> str:
     """The problem with the exit status and the output of a command, or an empty string."""
     if ended.status == HUNG:
         return f"hung; {ended.err[-500:]}"
@@ -235,7 +217,6 @@ def _of_lines(command: Command, ended: Ended) -> str:
 
 
 def _alike(meaning: Callable[[bytes], object], one: bytes, other: bytes) -> bool:
-    """Whether two files have the same meaning."""
     return _meaning(meaning, one) == _meaning(meaning, other)
 
 

@@ -29,19 +29,11 @@ HUNG = -1000
 
 @dataclass(frozen=True)
 class Process:
-    """A process to run.
+    """A process to run: arguments of ``mcdenoise``; or ``reader``, a name of ``table.READERS``, and a path.
 
-    Args:
-        command: arguments of ``mcdenoise``; or ``reader``, a name of ``table.READERS``, and a path.
-        folder: working directory, home directory and location of the cache.
-        stdout: file for its output; by default a new file.
-        seconds: time limit after which it counts as hung.
-        delay: seconds to wait before it starts.
-        kill_after: seconds after which it receives ``signal``.
-        signal: the signal that ends it.
-        largest_file: maximum size of a file in bytes, which simulates a full disk.
-        user: id of the user that it runs as.
-        environment: additional environment variables.
+    Its folder is the working directory, the home and the place of the cache; its output goes to a new file unless
+    ``stdout`` names one. It starts after ``delay`` seconds, receives ``signal`` after ``kill_after``, counts as hung
+    after ``seconds``, and may write no file larger than ``largest_file``, as on a full disk.
     """
 
     command: list[str]

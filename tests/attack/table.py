@@ -33,17 +33,10 @@ Meaning = Callable[[bytes], object]
 
 @dataclass(frozen=True)
 class Command:
-    """A command, or a reader of the API.
+    """A command, or a reader of the API, in a folder with copies of the world's files that it needs.
 
-    Args:
-        arguments: as on the command line, in a folder with copies of the world's files.
-        needs: the required files of the world.
-        result: returns the result, given the folder and the printed text; it must be equal for equal input.
-        progress: pattern of lines on stderr that are neither a warning nor an error.
-        statuses: allowed exit statuses.
-        requires: a module that the command needs.
-        seconds: time limit after which it counts as hung.
-        out: folder of the images that it writes.
+    Its result, of the folder and the printed text, is equal for equal input; its progress is a pattern of lines on
+    stderr that are neither a warning nor an error; it writes images to the folder out.
     """
 
     arguments: str
@@ -75,12 +68,10 @@ def filmed(folder: Path, _: str) -> object:
 
 
 def printed(_: Path, out: str) -> object:
-    """Checksum of the printed text."""
     return hashlib.sha256(out.encode()).hexdigest()
 
 
 def weights(folder: Path, _: str) -> object:
-    """Checksum of the tensors."""
     return tensors(folder / f"run/{MODEL}.safetensors")
 
 
@@ -92,12 +83,10 @@ def tensors(path: Path) -> object:
 
 
 def page(folder: Path, _: str) -> object:
-    """Whether the page is complete."""
     return (folder / "results/index.html").read_text().rstrip().endswith("</html>")
 
 
 def written(place: str) -> Callable[[Path, str], object]:
-    """Pixels of the images in a folder that a command writes."""
     return lambda folder, _: exr_files(folder / place)
 
 
@@ -106,7 +95,6 @@ def exr_files(folder: Path) -> dict[str, str]:
 
 
 def pictures(folder: Path, _: str) -> object:
-    """Pixels of all images written, in any format."""
     import OpenImageIO as oiio
 
     written = (path for path in sorted((folder / "out").iterdir()) if path.suffix != ".json")
@@ -168,19 +156,12 @@ def rounds(name: str) -> int:
     return 1 if name in SLOW else 4 if name.startswith("reader") else 2
 
 
-# What readers of the API read: the reader, where it has another name, and the file.
+# What readers of the API read that no command above does: the reader, where it has another name, and the file.
 READ = {
-    "exr": "exr shot/inputs/color0.exr",
-    "sequence": "sequence shot",
-    "layers": "sequence layers",
-    "zip": "sequence frame0.zip",
-    "hdr": "sequence still.hdr",
     "png": "sequence still.png",
-    "camera_matrices": "camera_matrices shot/inputs/camera_matrices.h",
     "camera_path": "camera_path path.json",
     "recipe": "recipe recipe.toml",
     "film": "film film.toml",
-    "weights": "weights weights.safetensors",
     "results": "results results",
     "run": "run run",
     "run_times": "run_times run_times.json",
@@ -191,7 +172,7 @@ READ = {
 }
 for name, line in READ.items():
     needs = ("film.toml", "shot") if name == "film" else (line.split()[1].partition("/")[0],)
-    COMMANDS[f"reader {name}"] = Command(f"reader {line}", needs, printed, requires="zarr" if name == "zip" else "")
+    COMMANDS[f"reader {name}"] = Command(f"reader {line}", needs, printed)
 
 
 def of(module: str, name: str, then: Callable[[Any], object] = lambda found: found) -> Callable[[Path], object]:
@@ -223,13 +204,10 @@ def read_halves(path: Path) -> object:
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "exr": read_exr,
     "sequence": of("data", "open_sequence", lambda found: [dict(found.frame(n).items()) for n in found.numbers]),
-    "camera_matrices": of("data.camera_matrices", "read_camera_matrices"),
     "camera_path": of("data.camera_path", "load_camera_path"),
     "recipe": read_recipe,
     "film": of("film", "read_film"),
-    "weights": of("models", "load_weights", lambda model: model.state_dict()),
     "results": Results.read,
     "run": read_run,
     "run_times": of("user_cache", "numbers_in"),
@@ -301,12 +279,9 @@ def toml(content: bytes) -> object:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file, and the commands that read it.
+    """A kind of file, by its path or a pattern, and the commands that read it.
 
-    Args:
-        path: path in the world, or a pattern, whose first match is used.
-        meaning: returns the meaning of its content; the results of commands depend only on this.
-        commands: names in :data:`COMMANDS`.
+    The results of commands depend on the meaning of its content alone.
     """
 
     path: str
@@ -315,33 +290,25 @@ class Kind:
 
 
 KINDS = {
-    "color": Kind(
-        "shot/inputs/color0.exr",
-        pixels,
-        ("denoise", "inspect", "evaluate model", "reader exr", "train", "benchmark"),
-    ),
+    "color": Kind("shot/inputs/color0.exr", pixels, ("denoise", "inspect", "evaluate model", "train", "benchmark")),
     "color of the second frame": Kind(
-        "shot/inputs/color1.exr",
-        pixels,
-        ("denoise", "denoise network", "reader sequence", "film", "film again"),
+        "shot/inputs/color1.exr", pixels, ("denoise", "denoise network", "film", "film again")
     ),
     "albedo": Kind("shot/inputs/albedo1.exr", pixels, ("denoise", "denoise network", "train")),
-    "normal": Kind("shot/inputs/shading_normal0.exr", pixels, ("denoise", "reader sequence")),
+    "normal": Kind("shot/inputs/shading_normal0.exr", pixels, ("denoise",)),
     "position": Kind("shot/inputs/world_position1.exr", pixels, ("denoise", "evaluate model")),
     "motion": Kind("shot/inputs/motion1.exr", pixels, ("denoise", "inspect")),
     "reference": Kind("shot/inputs/reference0.exr", pixels, ("evaluate", "evaluate model", "train")),
     "image to evaluate": Kind("out/denoised0.exr", pixels, ("evaluate",)),
-    "layers": Kind("layers/shot1.exr", pixels, ("denoise layers", "inspect layers", "reader layers")),
+    "layers": Kind("layers/shot1.exr", pixels, ("denoise layers", "inspect layers")),
     "camera.json": Kind("shot/inputs/camera.json", json.loads, ("denoise", "inspect", "evaluate model", "train")),
-    "camera_matrices.h": Kind(
-        "shot/inputs/camera_matrices.h", anything, ("denoise", "inspect", "reader camera_matrices")
-    ),
-    "weights": Kind("weights.safetensors", exactly, ("denoise network", "reader weights")),
-    "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), ("denoise hdr", "reader hdr")),
+    "camera_matrices.h": Kind("shot/inputs/camera_matrices.h", anything, ("denoise", "inspect")),
+    "weights": Kind("weights.safetensors", exactly, ("denoise network",)),
+    "hdr": Kind("still.hdr", partial(pixels, suffix=".hdr"), ("denoise hdr",)),
     "pfm": Kind("still.pfm", partial(pixels, suffix=".pfm"), ("denoise pfm",)),
     "tif": Kind("still.tif", partial(pixels, suffix=".tif"), ("denoise tif",)),
     "png": Kind("still.png", partial(pixels, suffix=".png"), ("reader png",)),
-    "zip": Kind("frame0.zip", entries, ("denoise zip", "reader zip")),
+    "zip": Kind("frame0.zip", entries, ("denoise zip",)),
     "recipe": Kind("recipe.toml", toml, ("reader recipe",)),
     "film": Kind("film.toml", toml, ("reader film", "film")),
     "camera path": Kind("path.json", json.loads, ("reader camera_path",)),

@@ -149,7 +149,7 @@ def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(name: str, here
     assert not (here / "out").exists()
 
 
-SHADOWED = (
+MODULES = [
     "numpy",
     "torch",
     "mitsuba",
@@ -161,7 +161,7 @@ SHADOWED = (
     "random",
     "multiprocessing",
     "bpy",
-)
+]
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ SHADOWED = (
 def test_modules_of_the_working_folder_are_not_imported(line: str, here: Path, small_sequence: Path) -> None:
     if "generate" in line:
         pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    for name in SHADOWED:
+    for name in MODULES:
         (here / f"{name}.py").write_text(f"open({str(here / 'touched')!r}, 'a').write({name!r})\nraise SystemExit(3)\n")
     (here / "film.toml").write_text(f'[[shot]]\nname = "a"\ninput = "{small_sequence}"\nmodel = "noisy"\n')
     (here / ".numba_config.yaml").write_text(f"cache_dir: {here}/hostile\n")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacker import Attacker, names, unreadable
+from attacker import Attacker, names, of_lines, unreadable
 from mutations import PLACES
 from table import COMMANDS, SLOW
 
@@ -72,7 +72,7 @@ def test_existing_outputs(attacker: Attacker, command: str) -> None:
             (folder / place).parent.mkdir(exist_ok=True)
             put(folder / place)
             ended = attacker.run(line, folder)
-            problem = attacker.lines(command.split(",")[0], ended)
+            problem = of_lines(COMMANDS[command.split(",")[0]], ended)
             problem = problem or attacker.touched(folder, tuple(line[1:2]))
             written = [name for name in names(folder) if name.startswith("out/") and name != place]
             if not problem and ended.status == 2 and place.startswith("figures") and written:
