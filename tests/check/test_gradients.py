@@ -8,16 +8,6 @@ from mcdenoise.check.cases import OPS, STEPS, Case, Op
 from mcdenoise.check.gradients import check_case, select
 
 
-class _Wrong(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: object, image: Tensor) -> Tensor:
-        return image * image
-
-    @staticmethod
-    def backward(ctx: object, gradient: Tensor) -> Tensor:
-        return gradient
-
-
 class _Forgetful(torch.autograd.Function):
     """A correct function whose gradient has no derivative in the image."""
 
@@ -48,22 +38,6 @@ def result_of(function: object, order: int = 2, images: int = 1) -> tuple[bool, 
     case = Case("pixels", "ordinary", lambda g: {"image": uniform(g, images, 1, 2, 3)}, ("image",))
     result = check_case(Op(function, (case,)), case, order)  # type: ignore[arg-type]
     return result.passed, result.message
-
-
-def test_a_correct_derivative_passes() -> None:
-    def square(image: Tensor) -> Tensor:
-        return image * image
-
-    assert result_of(square) == (True, "")
-
-
-def test_a_wrong_derivative_fails() -> None:
-    def square(image: Tensor) -> Tensor:
-        return _Wrong.apply(image)
-
-    passed, message = result_of(square)
-    assert not passed
-    assert "Jacobian mismatch" in message
 
 
 def test_a_wrong_second_derivative_fails() -> None:

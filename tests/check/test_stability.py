@@ -21,7 +21,6 @@ BY_NAME = {op.name: op for op in OPS}
 
 
 def failures(op: Op, dtype: torch.dtype = torch.float32) -> dict[str, set[str]]:
-    """The failed cases, by the property that fails."""
     found: dict[str, set[str]] = {}
     for check in check_op(op, (dtype,)):
         if not check.passed:
@@ -31,7 +30,6 @@ def failures(op: Op, dtype: torch.dtype = torch.float32) -> dict[str, set[str]]:
 
 
 def like(name: str, function: Callable[..., Any], **changes: Any) -> Op:
-    """An op of the table with another implementation."""
     op = replace(BY_NAME[name], function=function, **changes)
     function.__name__ = name
     return op
@@ -43,9 +41,7 @@ SLOW = ("affinity_filter", "atrous", "moments_variance", "temporal_gradient")
 
 # bfloat16 and float16 use the same code in the ops; `mcdenoise stability` checks all dtypes and cases.
 @pytest.mark.parametrize(
-    "op",
-    [pytest.param(op, marks=[pytest.mark.slow] if op.name in SLOW else []) for op in OPS],
-    ids=lambda op: op.name,
+    "op", [pytest.param(op, marks=[pytest.mark.slow] if op.name in SLOW else []) for op in OPS], ids=lambda op: op.name
 )
 def test_every_op_is_stable(op: Op) -> None:
     # In float64 all of them equal their equation, and the command has them all.

@@ -28,11 +28,15 @@ def blur(color: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(color, 5, 1, 2, count_include_pad=False)
 
 
-@pytest.mark.parametrize("how", ["mask", "alpha", "depth"])
-def test_charts_keep_their_light_up_to_their_borders(how: str) -> None:
+@pytest.mark.parametrize("how", ["mask", "alpha", "depth", "features"])
+@pytest.mark.parametrize("model", ["joint_bilateral", "guided", blur], ids=str)
+def test_charts_keep_their_light_up_to_their_borders_and_give_each_other_none(model: object, how: str) -> None:
+    """A window is wider than the gutter, and no feature tells one chart from the other."""
     color, valid = charts()
     buffers = {how: torch.where(valid > 0, 1, torch.inf) if how == "depth" else valid}
-    image = Denoiser(blur)(Frame(color, **buffers))
+    if how == "features":
+        buffers = {"mask": valid, "depth": valid, "normal": valid.expand(-1, 3, -1, -1)}
+    image = Denoiser(model)(Frame(color, **buffers))
     assert torch.equal(image * (1 - valid), torch.zeros_like(image))
     for columns, value in ((slice(3, 17), 1.0), (slice(23, 37), 0.05)):
         chart = image[..., 3:21, columns] / value
@@ -71,18 +75,6 @@ def test_the_fill_is_the_mirror_image() -> None:
     assert frame.color[0, 0, 0].tolist() == [6, 5, 4, 4, 5, 6, 7, 7, 6, 9, 9, 9]
 
 
-@pytest.mark.parametrize("features", [True, False], ids=["features", "color alone"])
-@pytest.mark.parametrize("model", ["joint_bilateral", "guided"])
-def test_charts_give_each_other_no_light(model: str, features: bool) -> None:
-    """A window is wider than the gutter, and no feature tells one chart from the other."""
-    color, valid = charts()
-    buffers = {"depth": valid, "normal": valid.expand(-1, 3, -1, -1)} if features else {}
-    image = Denoiser(model)(Frame(color, mask=valid, **buffers))
-    for columns, value in ((slice(3, 17), 1.0), (slice(23, 37), 0.05)):
-        chart = image[..., 3:21, columns] / value
-        assert 1 <= chart.min() <= chart.max() <= 1.2
-
-
 def test_a_chart_of_any_shape_is_one() -> None:
     spiral = torch.zeros(2, 1, 9, 9, dtype=torch.bool)
     spiral[..., 1:, :][..., ::2, :] = True
@@ -103,20 +95,6 @@ def test_light_where_nothing_is_means_that_nothing_is_void() -> None:
         assert torch.equal(Denoiser(blur)(frame), blur(color))
         frame = frame.replace(hints=Hints(alpha=True))
         assert torch.equal(without_void(frame)[0].color, color)
-
-
-@pytest.mark.parametrize(
-    "model", ["joint_bilateral", "guided", blur], ids=lambda model: getattr(model, "__name__", model)
-)
-def test_color_and_alpha_are_one_pair(model: object) -> None:
-    rows, columns = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
-    cover = (18.5 - ((rows - 24) ** 2 + (columns - 30) ** 2).sqrt()).div(2).clamp(0, 1)[None, None]
-    red = torch.tensor([0.8, 0.1, 0.05]).reshape(1, 3, 1, 1)
-    frame = Frame(cover * red, alpha=cover, layers={"half": cover * red / 2})
-    output = Denoiser(model, alpha=True).output(frame)
-    torch.testing.assert_close(output.image, output.alpha * red, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(output.alpha, cover)
-    torch.testing.assert_close(output.layers["half"], output.image / 2, rtol=1e-3, atol=1e-5)
 
 
 def test_a_stage_of_another_size_stays() -> None:

@@ -8,25 +8,11 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import LARGEST_RADIANCE
 from mcdenoise.nn.inputs import image_statistics
-from mcdenoise.nn.samples import CHANNELS, LeakyUNet, SampleEmbedding, samples_of
+from mcdenoise.nn.samples import LeakyUNet, samples_of
 
 
 def drawn(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-@torch.no_grad()
-def test_samples_in_another_order_are_embedded_alike() -> None:
-    torch.manual_seed(1)
-    network, samples = SampleEmbedding(CHANNELS, 4, 2, 1).double(), drawn(1, 3, CHANNELS, 6, 7)
-    embedded, context = network(samples)
-    turned, same = network(samples.flip(1))
-    torch.testing.assert_close(turned.flip(1), embedded)
-    torch.testing.assert_close(same, context)
-    # Twice each of them says nothing new.
-    twice, same = network(torch.cat([samples, samples], 1))
-    torch.testing.assert_close(twice[:, :3], embedded)
-    torch.testing.assert_close(same, context)
 
 
 @pytest.mark.parametrize("convolutions", [1, 3])

@@ -42,15 +42,6 @@ def test_shortcuts_of_inference_change_no_feature(dtype: torch.dtype) -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("levels", [4, 5])
-def test_unet_gives_three_scales_of_any_size(levels: int) -> None:
-    unet = UNet(5, [4, *[6] * (levels - 1)])
-    for height, width in ((1, 1), (7, 9), (16, 32)):
-        features = unet(torch.rand(2, 5, height, width))
-        sizes = [(-(-height // s), -(-width // s)) for s in (1, 2, 4)]
-        assert [tuple(f.shape) for f in features] == [(2, w, *size) for w, size in zip((4, 6, 6), sizes, strict=True)]
-
-
 # The warning is torch's own: it comes when its rules for forward mode are loaded.
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:

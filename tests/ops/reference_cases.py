@@ -22,8 +22,6 @@ FAST = [op for op in OPS if "numba" in backends_of(op.function)]
 
 
 def by(backend: Backend, function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function in one backend."""
-
     def run(*arguments: Any, **settings: Any) -> Any:
         with use(backend):
             return function(*arguments, **settings)

@@ -166,7 +166,6 @@ def test_the_default_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     assert chosen(LARGE.to("meta")) == "torch"
     assert chosen(LARGE.clone().requires_grad_()) == "torch"
     assert _backend.choose_backend([], [LARGE]) == "torch"
-    # The largest image counts.
     assert _backend.choose_backend(["numba"], [torch.rand(1, 3, 2, 2, 4), LARGE]) == "numba"
     assert by("torch", chosen)(LARGE) == "torch"
     assert by("numba", chosen)(SMALL) == "numba"

@@ -91,7 +91,6 @@ def passed(
     lag_threshold: float = 2.0,
     still: bool = False,
 ) -> list[Past]:
-    """Every frame of a shot with its past."""
     results: list[Past] = []
     before, history, length = Surface(), torch.empty(0), torch.empty(0)
     tests = lag_threshold < math.inf

@@ -22,7 +22,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def twice(tmp_path: Path, folder: Path) -> Callable[..., Any]:
-    """A function of a file, to be compiled."""
     path = tmp_path / "kernels_of_this_test.py"
     path.write_text(KERNEL)
     scope: dict[str, Any] = {}
@@ -31,7 +30,6 @@ def twice(tmp_path: Path, folder: Path) -> Callable[..., Any]:
 
 
 def hits(function: Callable[..., Any], value: Any) -> int:
-    """Return how often code was found, by a kernel that is as good as one of a new process."""
     kernel = numba.njit(function)
     kernel._cache = _Cache(function)
     assert kernel(value) == function(value)

@@ -54,7 +54,6 @@ def test_equals_the_equation_in_float64(op: Op) -> None:
         inputs = case.inputs()
         expected = as_tuple(oracle(op.name)(**inputs, **case.settings))
         assert_same(results_of(op, inputs, case), expected, note=case.name)
-        # Inputs are left alone.
         assert_same(tensors_in(inputs), tensors_in(case.inputs()), rtol=0)
 
 

@@ -1,25 +1,18 @@
 """Bicubic resampling: known answers, torch's own, and what it does to a history."""
 
-import cmath
-import math
-
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise import ops
-from mcdenoise.ops import reproject, resample
+from mcdenoise.ops import resample
 
 BACKENDS = ("torch", "numba")
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def shift(right: float, down: float, height: int, width: int) -> Tensor:
-    return torch.tensor([right, down], dtype=torch.float64).reshape(1, 2, 1, 1).expand(1, 2, height, width)
 
 
 def by_torch(previous: Tensor, motion: Tensor) -> Tensor:
@@ -57,17 +50,3 @@ def nearest(previous: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
     ]
     taps = torch.stack([previous.flatten(2).gather(2, at.flatten(2)).reshape(previous.shape) for at in places])
     return taps.amin(0), taps.amax(0)
-
-
-def test_a_history_stays_sharper_than_by_bilinear_interpolation() -> None:
-    # Stripes of eight pixels and of amplitude 1 move by 0.4 pixels a frame, for eight frames.
-    x = torch.arange(64, dtype=torch.float64)
-    motion = shift(0.4, 0, 8, 64)
-    bilinear = bicubic = (1 + torch.cos(2 * torch.pi * x / 8)).expand(1, 1, 8, 64)
-    for _ in range(8):
-        bilinear, bicubic = reproject(bilinear, motion)[0], resample(bicubic, motion)
-    waves = torch.exp(-2j * torch.pi * x / 8)
-    amplitudes = [2 * ((each[0, 0, 0] - 1) * waves)[16:48].mean().abs() for each in (bilinear, bicubic)]
-    step = 0.6 + 0.4 * cmath.exp(2j * math.pi / 8)
-    assert float(amplitudes[0]) == pytest.approx(abs(step) ** 8)
-    assert float(amplitudes[1]) == pytest.approx(1, abs=0.1)

@@ -38,15 +38,3 @@ def test_noise_within_two_standard_errors_is_none() -> None:
     assert 0.0 < wide < 0.15
     # A change by three parts in a hundred, in strata of 9 and then 9 of them, is seen through noise of seven.
     assert (temporal_gradient(1.1 * now, before, None, variance, levels=3) > 0.08).double().mean() > 0.95
-
-
-def test_one_sample_of_a_stratum_stands_for_it() -> None:
-    """Those of the other pixels may be anything."""
-    sampled = torch.zeros(1, 1, HEIGHT, WIDTH, dtype=torch.float64)
-    sampled[..., 2::3, ::3] = 1
-    now, before = light(), light(1)
-    found = temporal_gradient(now, before, sampled)
-    inside = now[..., 2::3, ::3], before[..., 2::3, ::3]
-    torch.testing.assert_close(found[..., ::3, ::3], temporal_gradient(*inside, stratum=1))
-    torch.testing.assert_close(temporal_gradient(1e3 * (1 - sampled) + now, before, sampled), found)
-    assert not temporal_gradient(now, before, 0 * sampled).any()

@@ -63,7 +63,6 @@ def test_forward_mode_is_the_transpose_of_reverse_mode(op: Op, case: Case) -> No
     with forward_ad.dual_level():
         dual = function(*(forward_ad.make_dual(*each) for each in zip(leaves, tangents, strict=True)))
         torch.testing.assert_close(forward_ad.unpack_dual(dual).tangent, moved, rtol=1e-12, atol=1e-12)
-    # The same holds for one argument at a time.
     alone = [
         torch.func.jvp(lambda x, i=i: function(*leaves[:i], x, *leaves[i + 1 :]), (leaves[i],), (tangents[i],))[1]
         for i in range(len(leaves))
@@ -87,7 +86,6 @@ def test_vmap_is_a_loop(op: Op, case: Case) -> None:
         plain = torch.autograd.grad(expected.cos().sum(), one, allow_unused=True, materialize_grads=True)
         for found_gradient, gradient in zip(gradients, plain, strict=True):
             torch.testing.assert_close(found_gradient[i], gradient, rtol=1e-9, atol=1e-11)
-    # The same holds for one argument at a time, beside others that have no such axis.
     for k in range(len(leaves)):
         dims = tuple(0 if i == k else None for i in range(len(leaves)))
         arguments = [several[i] if i == k else leaves[i] for i in range(len(leaves))]

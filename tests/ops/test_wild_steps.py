@@ -33,7 +33,6 @@ Call = tuple[Callable[..., Any], list[Any]]
 
 
 def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tensor], Tensor] = as_it_is) -> list[Call]:
-    """Every step with arguments of its kind."""
     batch, height, width = size
 
     def some(seed: int, channels: int, like: torch.dtype = dtype) -> Tensor:

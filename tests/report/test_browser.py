@@ -59,7 +59,6 @@ def tab(browser: Any, page: Path) -> Iterator[Any]:
 
 
 def pixels(tab: Any) -> np.ndarray:
-    """Return the pixels that the comparer's canvas shows."""
     uri = tab.evaluate("document.querySelector('#stage canvas').toDataURL()")
     return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2]))).convert("RGB")).astype(int)
 
@@ -71,12 +70,10 @@ def choose(tab: Any, left: str, right: str) -> None:
 
 
 def at(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """The pixel at parts of width and height."""
     return image[int(y * image.shape[0]), int(x * image.shape[1])]
 
 
 def shown(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """Return the value that a display shows there for a scene-linear frame."""
     return at(to_srgb(image), x, y).astype(int)
 
 
@@ -150,7 +147,6 @@ def test_error_map_has_the_colours_of_its_legend(tab: Any):
         for y, x in zip(rows.flat, columns.flat, strict=True)
     ]
     assert np.abs(np.array(found) - smape[rows, columns].ravel().clip(0, 0.5)).max() < 0.02
-    # The reference has no error.
     assert np.abs(at(canvas, 0.8, 0.5) - colors[0]).max() <= 1
 
 

@@ -12,16 +12,6 @@ def test_front_of_known_points():
     assert pareto_front(values) == [1, 2]
 
 
-def test_every_method_off_the_front_is_beaten_by_one_on_it():
-    values = [((7 * i) % 11 + 1.0, (5 * i) % 13 + 1.0) for i in range(30)]
-    front = pareto_front(values)
-    for cost, error in values:
-        assert any(values[i][0] <= cost and values[i][1] <= error for i in front)
-    errors = [values[i][1] for i in front]
-    assert errors == sorted(errors, reverse=True)
-    assert len(set(errors)) == len(errors)
-
-
 def test_mean_over_scenes(folder: Path):
     results = Results.read(folder)
     mean, first, second = views(results)

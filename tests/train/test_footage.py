@@ -57,7 +57,6 @@ def noisy_features(noisy: Path) -> Path:
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """Frame number and noise seed of every frame that is decoded."""
     read, seen = Sequence.frame, []
 
     def spy(sequence: Sequence, number: int, reference: bool = True, noise_seed: int = 0, **options: Any) -> Any:
@@ -69,7 +68,6 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
 
 
 def opened(path: Path, folder: Path, front: Front = FRONT, features: Iterable[str] = FEATURES) -> list[Shot]:
-    """Shots of clips of two frames that begin at every second frame."""
     return shots_of(open_sequence(path), front, frozenset(features), 2, folder, start_every=2)[0]
 
 
@@ -78,12 +76,10 @@ def digest(path: Path, folder: Path) -> str:
 
 
 def pixels(shots: list[Shot]) -> torch.Tensor:
-    """All that is in the first shot."""
     return torch.cat(list(shots[0].read().values()), 1)
 
 
 def entries(folder: Path) -> list[str]:
-    """Every file of a cache."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
@@ -135,23 +131,6 @@ def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:
     # The sequence's own comes first.
     own = opened(noisy, tmp_path / "cache", features=["motion"])[1].read()
     assert (own["motion"] == 1.5).all()
-
-
-@pytest.mark.parametrize(("stem", "value"), [("color2", 3e38), ("reference2", np.nan), ("color2", -1.0)])
-def test_a_pixel_that_is_no_radiance_is_that_of_its_neighbours_and_a_negative_one_black(
-    small_sequence: Path, tmp_path: Path, stem: str, value: float
-) -> None:
-    for name in ("color2", "albedo2", "reference2"):
-        path = small_sequence / "inputs" / f"{name}.exr"
-        image = np.full((20, 24, 3), 0.5, np.float32)
-        if name == stem:
-            image[10, 10] = value
-        write_exr(path, image, ["R", "G", "B"], full_float=True)
-    part = opened(small_sequence, tmp_path / "cache", front=Front(), features=[])[0].read(slice(2, 3))
-    expected = torch.full((1, 3, 20, 24), 0.5)
-    expected[..., 10, 10] = 0 if value < 0 else 0.5
-    for name in ("color", "reference"):
-        assert torch.equal(part[name], expected if stem.startswith(name) else torch.full_like(expected, 0.5))
 
 
 def test_cached_frames_are_not_decoded_again(noisy: Path, tmp_path: Path, reads: list[tuple[int, int]]) -> None:
