@@ -19,7 +19,6 @@ def truncated(g: Generator, content: bytes) -> bytes:
 
 
 def flipped(g: Generator, content: bytes, end: int | None = None) -> bytes:
-    """Some bits flipped, mostly in one place."""
     damaged = bytearray(content)
     for _ in range(int(g.integers(1, 9))):
         damaged[int(g.integers(0, min(end or len(content), len(content))))] ^= 1 << int(g.integers(0, 8))
@@ -88,13 +87,7 @@ DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
 
 
 def outcomes(folder: Path, files: Mapping[str, bytes], written: Path) -> dict[str, str]:
-    """Return what the reader made of each file; the effects on the process are asserted here.
-
-    Args:
-        folder: for the files.
-        files: contents by name.
-        written: folder to write each to, after it was read as a shot.
-    """
+    """What the reader made of each file, which is then written as a shot; effects on the process are asserted."""
     folder.mkdir()
     for name, content in files.items():
         (folder / name).write_bytes(content)

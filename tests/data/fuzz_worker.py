@@ -23,7 +23,6 @@ MEMORY = 512 * 2**20
 
 
 def taken() -> int:
-    """Bytes of address space that this process has."""
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals a
 
 
 def stuck(how: Callable[[Path], AbstractContextManager[Path]], path: Path) -> int:
-    """The id of a process in the middle of writing."""
     ready, told = os.pipe()
     with warnings.catch_warnings():
         # It runs nothing of the threads that torch has started.
@@ -43,12 +42,6 @@ def end(process: int) -> None:
     os.waitpid(process, 0)
 
 
-def age(folder: Path) -> None:
-    """Let everything in a folder be of an hour ago."""
-    for path in folder.iterdir():
-        os.utime(path, (time.time() - 3600,) * 2)
-
-
 @pytest.mark.parametrize("how", [atomic_path, new_folder])
 def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(
     tmp_path: Path, how: Callable[[Path], AbstractContextManager[Path]]
@@ -63,7 +56,9 @@ def test_only_leftovers_of_a_killed_process_are_removed_by_the_next(
         end(killed)
         hidden = {path for path in tmp_path.iterdir() if len(path.name) > 25}
         assert len(hidden) == 2
-        age(tmp_path)
+        # An hour passes.
+        for path in tmp_path.iterdir():
+            os.utime(path, (time.time() - 3600,) * 2)
         files._swept.clear()
         write_text(tmp_path / "whole.txt", "text")
         left = {path.name for path in tmp_path.iterdir()} - {".mcdenoise-link.tmp", *others, "whole.txt"}

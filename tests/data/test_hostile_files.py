@@ -1,7 +1,4 @@
-"""Files that are whole and yet no image of a frame, or that have names to trip over: refused in one line, or read.
-
-The damaged ones are those of ``test_fuzz.py``.
-"""
+"""Files that are whole and yet no image of a frame, or that have names to trip over: refused in one line, or read."""
 
 import os
 import shutil

@@ -182,7 +182,6 @@ def test_positions_are_seen_at_their_pixels(tmp_path: Path) -> None:
 
 
 def changed(path: Path, target: Path, change: dict[str, bytes | None]) -> Path:
-    """A copy of a zip with other contents of some entries, or without them."""
     with zipfile.ZipFile(path) as source, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as copy:
         for name in source.namelist():
             content = change.get(name, source.read(name))

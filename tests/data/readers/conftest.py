@@ -12,7 +12,6 @@ Image = np.ndarray[Any, Any]
 
 @pytest.fixture(scope="session")
 def rendered() -> Path:
-    """The folder of what real renderers wrote."""
     return Path(__file__).parents[1] / "renderers"
 
 

@@ -22,7 +22,6 @@ def part(channels: str, name: str = "", integers: str = "") -> Part:
 
 
 def found(channels: str, label: str = "render") -> dict[str, str]:
-    """The buffers of a file's layers, by the layers."""
     layers = layers_of(0, label, [part(channels)])
     return {str(layer): recognised[0] for layer in layers if (recognised := recognise(layer)) is not None}
 

@@ -16,7 +16,6 @@ D = Path("/d")
 
 
 def groups(*names: str) -> dict[str, dict[int, str]]:
-    """The kinds of files, by their pattern."""
     return {
         pattern_of(group): {number: path.name for number, path in group.files.items()}
         for group in group_files([D / name for name in names])[0]
@@ -190,7 +189,6 @@ def test_the_layout_of_oidn(image: Callable[..., list[Path]], tmp_path: Path) ->
     (tmp_path / "out").mkdir()
     written = [sequence.write(tmp_path / "out", number, np.ones((*SIZE, 3), np.float32)).name for number in (0, 1)]
     assert written == ["bath_0008spp.hdr.exr", "kitchen_0008spp.hdr.exr"]
-    # One alone is a still as well.
     alone = open_sequence(tmp_path / "training" / "bath_*.exr")
     assert (alone.layout, alone.numbers) == ("oidn", [0])
 

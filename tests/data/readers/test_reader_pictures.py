@@ -18,7 +18,6 @@ SIZE = (12, 16)
 
 
 def picture(path: Path, kind: str, channels: int = 3, **attributes: Any) -> Image:
-    """Write random values, and return them as stored."""
     pixels = np.random.default_rng(0).integers(1, 200, (*SIZE, channels)) / 255
     save(path, dict(zip("RGB" if channels > 1 else "Y", np.moveaxis(pixels, -1, 0), strict=True)), kind, **attributes)
     return stored(path)
@@ -104,7 +103,6 @@ def test_the_color_space_of_a_picture_is_kept(
     color = sequence.frame(0).color[0].movedim(0, -1).numpy()
     assert color.shape == (*SIZE, 3)
     np.testing.assert_allclose(color, np.broadcast_to(CURVES[curve](before), color.shape), rtol=3e-3, atol=1e-5)
-    # Only display values are warned of.
     assert any("brighter than white" in warning for warning in sequence.warnings) is (curve != "linear")
     (tmp_path / "out").mkdir()
     after = stored(sequence.write(tmp_path / "out", 0, color))
@@ -121,7 +119,6 @@ def test_one_channel_is_denoised_and_written_as_one(names: str, tmp_path: Path) 
     path = save(tmp_path / "ao_0001.exr", channels)
     status, text, errors = run("denoise", path, "-o", tmp_path / "out", "--model", "wild_small", "--threads", "1")
     assert (status, errors) == (0, "")
-    # One loud line says what is missing.
     assert text.count("NO FEATURES") == ("Z" not in names)
     assert ("without albedo" in text) is ("Z" in names)
     after = oiio.ImageBuf(str(tmp_path / "out" / path.name))

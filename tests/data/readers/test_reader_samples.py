@@ -26,13 +26,11 @@ def drawn(channels: int = 3) -> Image:
 
 
 def picture(samples: Image) -> Image:
-    """The mean ``(H, W, 3)``."""
     mean: Image = samples[:, :3].mean(0).transpose(1, 2, 0)
     return mean
 
 
 def in_color(samples: Image) -> dict[str, Image]:
-    """Channels of one file with the color and each sample."""
     channels = {letter: picture(samples)[..., i] for i, letter in enumerate("RGB")}
     return channels | {f"sample{k}.{c}": s[i] for k, s in enumerate(samples) for i, c in enumerate("RGB")}
 

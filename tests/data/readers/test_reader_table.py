@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
 import pytest
+from pictures import channels_of
 
 from mcdenoise.data import open_sequence
 
@@ -112,9 +112,7 @@ def test_cameras_found_from_positions_lead_where_motion_does(renderer: str, othe
 
 
 def layer(path: Path, name: str, components: str) -> Image:
-    """A layer as the library of the format reads it, whatever part it is in."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {each: channel.pixels for part in file.parts for each, channel in part.channels.items()}
+    channels = channels_of(path)
     return np.stack([channels[f"{name}.{each}" if name else each] for each in components], -1).astype(np.float32)
 
 

@@ -43,7 +43,6 @@ def light(seed: int) -> Image:
 
 
 def blurred(image: Image, sigma: float) -> Image:
-    """The image through a lens of this blur in pixels."""
     size = 2 * int(3 * sigma) + 1
     lens = gaussian_blur2d(torch.from_numpy(image).movedim(-1, 0)[None], (size, size), (sigma, sigma))
     return lens[0].movedim(0, -1).numpy()

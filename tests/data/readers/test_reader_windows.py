@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
+from pictures import stored
 
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence
@@ -31,15 +32,6 @@ def part(channels: dict[str, Image], top: int, left: int, name: str = "", displa
 def radiance(height: int, width: int, seed: int) -> dict[str, Image]:
     pixels = np.random.default_rng(seed).gamma(2, 0.2, (3, height, width)).astype(np.float32)
     return dict(zip("RGB", pixels, strict=True))
-
-
-def stored(path: Path) -> list[tuple[tuple[int, int], dict[str, Image]]]:
-    """First row and column, and channels, of each part."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return [
-            (tuple(each.header["dataWindow"][0][::-1].tolist()), {n: c.pixels for n, c in each.channels.items()})
-            for each in file.parts
-        ]
 
 
 WINDOWS = [(4, 5, 20, 30), (6, 9, 24, 28), (0, 30, 10, 34)]
@@ -76,7 +68,7 @@ def test_each_file_is_written_in_its_own_window(cropped: Path, tmp_path: Path, o
     denoise_sequence(open_sequence(cropped), tmp_path / "out", Denoiser("noisy"), "noisy", **options)
     for path in sorted(cropped.iterdir()):
         ((before, old),), ((after, new),) = stored(path), stored(tmp_path / "out" / path.name)
-        assert before == after
+        assert str(before["dataWindow"]) == str(after["dataWindow"])
         for name in "RGBZ":
             np.testing.assert_array_equal(old[name], new[name])
         for name in "RGB" if options else "":
@@ -95,7 +87,7 @@ def test_a_cropped_feature_is_placed_where_it_belongs(tmp_path: Path) -> None:
     assert bool((frame.mask == 1).all())
     denoise_sequence(sequence, tmp_path / "out", Denoiser("noisy"), "noisy")
     for (before, old), (after, new) in zip(stored(path), stored(tmp_path / "out/shot.exr"), strict=True):
-        assert before == after
+        assert str(before["dataWindow"]) == str(after["dataWindow"])
         assert all(np.array_equal(old[name], new[name]) for name in old)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from pictures import save
+from pictures import channels_of, save, stored
 from refusals import refused
 
 from mcdenoise import Denoiser
@@ -32,22 +32,11 @@ def noise(*shape: int, seed: int = 0) -> Image:
     return np.random.default_rng(seed).random(shape, dtype=np.float32)
 
 
-def stored(path: Path) -> list[tuple[dict[str, Any], dict[str, Image]]]:
-    """Header and channels of every part, as the library of the format reads them."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        return [
-            (dict(part.header), {name: channel.pixels.copy() for name, channel in part.channels.items()})
-            for part in file.parts
-        ]
-
-
 def header(entries: dict[str, Any]) -> dict[str, str]:
-    """Return the entries of a header, comparable; the list of its channels is compared by itself."""
     return {name: str(value) for name, value in entries.items() if name not in ("channels", "chunkCount")}
 
 
 def same_but_for(before: Path, after: Path, replaced: set[str]) -> None:
-    """All parts, headers and channels are those of before, but for the pixels of some channels."""
     old, new = stored(before), stored(after)
     assert len(old) == len(new)
     for (old_header, old_channels), (new_header, new_channels) in zip(old, new, strict=True):
@@ -56,10 +45,6 @@ def same_but_for(before: Path, after: Path, replaced: set[str]) -> None:
         for name, pixels in old_channels.items():
             assert new_channels[name].dtype == pixels.dtype, name
             assert np.array_equal(new_channels[name].view(np.uint8), pixels.view(np.uint8)) == (name not in replaced)
-
-
-def channels_of(path: Path) -> dict[str, Image]:
-    return {name: pixels for _, channels in stored(path) for name, pixels in channels.items()}
 
 
 @pytest.mark.parametrize(
@@ -88,7 +73,6 @@ def test_a_renderers_file_comes_back_with_other_radiance(
         for layer in layers:
             found = np.stack([channels[f"{layer}.{each}" if layer else each] for each in "RGB"], -1)
             np.testing.assert_array_equal(found.astype(np.float32), image)
-    # Nothing lies beside them.
     assert len(list(tmp_path.iterdir())) == len(sequence)
 
 
@@ -101,7 +85,6 @@ def test_a_layer_can_be_added_instead(rendered: Path, tmp_path: Path) -> None:
     assert set(new) == set(old) | set(added)
     assert all(np.array_equal(new[name].view(np.uint8), pixels.view(np.uint8)) for name, pixels in old.items())
     np.testing.assert_array_equal(np.stack([new[name] for name in added], -1).astype(np.float32), image)
-    # It is a layer like any other.
     again = open_sequence(path, mapping=["color=Clean"], color_has_albedo=True)
     np.testing.assert_array_equal(again.frame(2).color[0].permute(1, 2, 0).numpy(), image)
 

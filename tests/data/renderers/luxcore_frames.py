@@ -52,7 +52,6 @@ def main():
 
 
 def describe(pyluxcore, frame):
-    """The scene of one frame."""
     scene = pyluxcore.Scene()
     settings = {
         "scene.camera.type": ["perspective"],

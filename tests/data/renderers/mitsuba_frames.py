@@ -35,7 +35,6 @@ def main():
 
 
 def describe(mi, frame, width, height, samples):
-    """The scene of one frame, as Mitsuba's dictionary."""
     place = mi.ScalarTransform4f
     checks = {
         "type": "checkerboard",

@@ -103,16 +103,7 @@ RENDERERS = {
 
 
 def write(renderer, folder, frames=FRAMES):
-    """Write frames as ``renderer`` names them; they were not rendered by it.
-
-    Args:
-        renderer: a key of :data:`RENDERERS`.
-        folder: where to write; it is made where it is missing.
-        frames: which frames of ``blender/`` to take, 1 to 4.
-
-    Returns:
-        The paths of the files, frame by frame.
-    """
+    """Write frames, of 1 to 4, as ``renderer`` names them, and return their paths; it did not render them."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -126,7 +117,6 @@ def write(renderer, folder, frames=FRAMES):
 
 
 def channels_of(layers, pixels):
-    """The channels of layers of :data:`RENDERERS`."""
     channels, words = {}, iter(layers.split())
     for layer, image in zip(words, words, strict=True):
         name, mark, letters = re.fullmatch(r"(.*?)(?:([.:])(\w+))?", layer).groups()
@@ -137,7 +127,6 @@ def channels_of(layers, pixels):
 
 
 def images(source):
-    """All that renderers store of a frame."""
     hit, one = source["hit"], source["hit"][..., None].astype(np.float32)
     depth, motion, color = source["depth"], source["motion"], source["color"]
     nothing, light = 0 * depth[..., None], source["color"] - source["diffuse"]
@@ -230,7 +219,6 @@ def variance(image):
 
 
 def save(path, channels, attributes):
-    """Write float channels in their given order."""
     pixels = np.ascontiguousarray(np.stack(list(channels.values()), -1), dtype=np.float32)
     height, width, count = pixels.shape
     spec = OpenImageIO.ImageSpec(width, height, count, OpenImageIO.FLOAT)
