@@ -130,18 +130,6 @@ def test_the_background_has_a_history(small_sequence: Path) -> None:
     torch.testing.assert_close(seen.color * sky, frame.color * sky)
 
 
-def test_the_published_rule_can_be_asked_for(small_sequence: Path) -> None:
-    sequence = open_sequence(small_sequence)
-    history = Shot(alpha_min=0.2, rule="bmfr", position_limit=1.0, normal_limit=0.25)
-    for number in sequence.numbers:
-        seen = history.update(sequence.frame(number))
-    assert seen.length.max() == len(sequence)
-    nothing_alike = Shot(alpha_min=0.2, rule="bmfr", position_limit=0.0, normal_limit=0.25)
-    for number in sequence.numbers:
-        seen = nothing_alike.update(sequence.frame(number))
-    assert seen.reset == "cut"
-
-
 @pytest.mark.parametrize("rule", ["relative", "bmfr"])
 def test_any_buffers_may_come_and_go(rule: Rule) -> None:
     """A buffer that only one of two frames has is not compared; where none can be, each frame stands alone."""
@@ -181,7 +169,6 @@ def test_a_firefly_does_not_survive(with_albedo: bool) -> None:
         color[..., 4, 4] *= 1e4 if number == 0 else 1
         seen = history.update(still(color, **buffers))
         assert seen.color[..., 4, 4].unique().item() == pytest.approx(1 + 14 / (number + 1), rel=1e-5)
-    # Nothing else differs.
     seen.color[..., 4, 4] = 1
     torch.testing.assert_close(seen.color, constant(3, 1.0, (9, 9)))
 

@@ -62,10 +62,7 @@ def test_a_light_that_goes_out_is_gone_at_once() -> None:
 
 
 def test_noise_is_hardly_taken_for_a_change() -> None:
-    """Steady light with the noise of one sample keeps a history of hardly less than the 10 frames of ``alpha``.
-
-    Pixels that exceed two standard errors of a neighbourhood discard as much, which is a few parts in a hundred.
-    """
+    """Pixels beyond two standard errors of a neighbourhood discard as much: a few parts in a hundred."""
     model, plain, state, other = Asvgf(alpha=0.1), Svgf(alpha=0.1), None, None
     for seed in range(16):
         output, state = model(frame(seed=seed), state)

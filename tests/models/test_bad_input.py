@@ -63,10 +63,6 @@ KEEPING = [name for name in KINDS if name not in ("noisy", "oidn", "oidn_open")]
 DEMANDING = [name for name in KINDS if model_of(name).needs.buffers != {"color"}]
 
 
-def said_to_do(message: str) -> list[str]:
-    return message.partition("a model that does without: ")[2].split(", ")
-
-
 @torch.no_grad()
 @pytest.mark.parametrize("name", DEMANDING)
 def test_a_missing_buffer_is_named_with_methods_that_do_without(name: str) -> None:
@@ -81,7 +77,7 @@ def test_a_missing_buffer_is_named_with_methods_that_do_without(name: str) -> No
         for message in messages:
             assert message.startswith("buffer")
             assert all(f"'{each}'" in message.partition(":")[0] for each in absent)
-            others = said_to_do(message)
+            others = message.partition("a model that does without: ")[2].split(", ")
             assert {*pretrained_models(), "joint_bilateral"} <= {name, *others}
             assert "noisy" not in others
             for other in others:
@@ -96,16 +92,6 @@ def test_methods_that_would_do_are_found_without_drawing_numbers() -> None:
     torch.manual_seed(3)
     refused(lambda: model_of("svgf")(Frame(torch.rand(1, 3, 4, 5, generator=torch.Generator()))))
     assert torch.equal(torch.rand(2), expected)
-
-
-def test_a_function_of_buffers_says_which_it_takes() -> None:
-    def mine(color: Tensor, emission: Tensor, roughness: Tensor | None = None) -> Tensor:
-        return color * emission
-
-    message = refused(lambda: as_model(mine)(Frame(torch.rand(1, 3, 4, 5))))
-    assert message == (
-        "buffer 'emission': mine takes it, found only color; render it, or give that argument a default value"
-    )
 
 
 @torch.no_grad()

@@ -122,6 +122,5 @@ def test_anti_aliasing_is_that_of_the_public_code() -> None:
     for motion in (None, still + 9):
         alone, _ = model(Frame(colors[1:], motion=motion), state)
         torch.testing.assert_close(alone.image, colors[1:])
-    # This holds in any unit.
     _, state = model(Frame(1e6 * colors[:1], motion=still))
     torch.testing.assert_close(model(Frame(1e6 * colors[1:], motion=still), state)[0].image, 1e6 * second.image)

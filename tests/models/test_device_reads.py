@@ -23,6 +23,7 @@ from toys import Same, one_of_each, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
 from mcdenoise.models import Accumulated, Demodulated, Output, _report, _times, list_models
+from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._times import Times
@@ -192,7 +193,6 @@ def test_bad_values_are_told_a_frame_late_and_the_history_begins_anew(name: str)
         told = refused(lambda: denoiser(good[2]))
         assert told.startswith(message)
         assert told.endswith("(of the last frame, told a frame late; the history begins anew)")
-        # Told once.
         denoiser(good[2])
         assert denoiser.report.reset == "first frame"
         denoiser(bad)
@@ -200,23 +200,14 @@ def test_bad_values_are_told_a_frame_late_and_the_history_begins_anew(name: str)
         assert denoiser.report.history is not None
 
 
-def test_layers_that_are_no_parts_are_told_late() -> None:
-    denoiser = Denoiser(Same())
+def test_layers_that_are_no_parts_and_images_that_are_not_finite_are_told_late() -> None:
+    denoiser, broken = Denoiser(Same()), Denoiser(FromBuffers(lambda color: color / 0))
     (frame,) = shot(denoiser.model, 1)
     with without_reads():
         denoiser.output(frame.replace(layers={"twice": 2 * frame.color}))
+        broken(frame)
     assert refused(lambda: denoiser.report).startswith("layers: expected parts of the color, found twice brighter")
-
-
-def test_an_image_that_is_not_finite_is_told_late() -> None:
-    class Broken(Same):
-        def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
-            return Output(frame.color.index_fill(3, torch.tensor([2]), torch.nan)), None
-
-    denoiser = Denoiser(Broken())
-    with without_reads():
-        denoiser(shot(denoiser.model, 1)[0])
-    assert f"found {SIZE[0]} NaN or infinite pixels" in refused(lambda: denoiser.report)
+    assert f"found {SIZE[0] * SIZE[1]} NaN or infinite pixels" in refused(lambda: broken.report)
 
 
 def test_repairs_are_those_of_validation() -> None:

@@ -54,7 +54,6 @@ def test_color_only_is_the_diffuse_branch() -> None:
     alone = frame.replace(diffuse=None, specular=None)
     expected = filtered(network.diffuse, frame.color, frame)
     torch.testing.assert_close(network(alone)[0].image, expected, rtol=1e-9, atol=1e-9)
-    # One part without the other says no more.
     torch.testing.assert_close(network(frame.replace(specular=None))[0].image, expected, rtol=1e-9, atol=1e-9)
     dark = frame.replace(diffuse=frame.color, specular=torch.zeros_like(frame.color))
     torch.testing.assert_close(network(dark)[0].image, expected, rtol=1e-9, atol=1e-9)

@@ -93,22 +93,6 @@ def test_layers_sum_to_the_image_in_float64_and_have_derivatives(name: str) -> N
         assert bool(gradient.any()) is not (name in HISTORY_OF_IMAGES and frame is second)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
-def test_layers_of_tiles_are_those_of_the_image(name: str) -> None:
-    whole = Denoiser(small(name))
-    if not any(isinstance(part, Tiled) for part in _modules(whole.model)):
-        pytest.skip("it is not divided")
-    tiled = Denoiser(small(name), tile=64)
-    for frame in shot(whole.model, 2, (70, 150)):
-        expected, found = whole.output(frame), tiled.output(frame)
-        assert_sum(found.image, found.layers)
-        for key, layer in expected.layers.items():
-            # Convolutions of another size sum in another order; logarithms and kernels pass that on.
-            torch.testing.assert_close(found.layers[key], layer, rtol=1e-3, atol=1e-4)
-
-
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_a_layer_that_is_all_is_the_image_and_one_that_is_black_stays_black(name: str) -> None:
@@ -171,20 +155,6 @@ def test_black_frames_have_black_layers(name: str) -> None:
         black = torch.zeros_like(frame.color)
         output = denoiser.output(frame.replace(color=black, layers={"a": black, "b": black}))
         assert_sum(output.image, output.layers)
-
-
-def _modules(model: Any) -> list[Any]:
-    return list(model.modules()) if isinstance(model, nn.Module) else [model]
-
-
-def test_any_parts_of_the_color_may_be_asked_for() -> None:
-    """A layer does not depend on which others are asked for with it."""
-    every, some = Denoiser(small("kp")), Denoiser(small("kp"))
-    for frame in shot(every.model):
-        expected = every.output(frame)
-        found = some.output(with_layers(frame, glossy=frame.layers["glossy"]))
-        assert tuple(found.layers) == ("glossy",)
-        torch.testing.assert_close(found.layers["glossy"], expected.layers["glossy"], rtol=1e-4, atol=1e-5)
 
 
 def test_stages_are_asked_for_by_themselves() -> None:

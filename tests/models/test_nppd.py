@@ -12,12 +12,7 @@ from mcdenoise.ops import reproject
 
 
 def decided(**biases: Tensor | float) -> Any:
-    """A model whose weights do not depend on the frame: softmaxes of zeros, or of what is given.
-
-    Args:
-        biases: logits at the finest scale by what they are of, ``splat``, ``previous``, ``mu``, ``trust``,
-            ``partition``.
-    """
+    """A model whose weights do not depend on the frame: softmaxes of zeros, or of logits at the finest scale."""
     model = small("nppd")
     places = {"splat": slice(0, 25), "previous": slice(25, 50), "mu": 50, "trust": 51, "partition": slice(52, 57)}
     with torch.no_grad():
@@ -59,7 +54,6 @@ def test_a_constant_image_stays_constant_away_from_the_border() -> None:
     image = model(frame)[0].image
     torch.testing.assert_close(image[..., 31:-31, 31:-31], torch.full((1, 3, 66, 98), 0.7))
     assert not torch.isclose(image[..., 30, 80], torch.tensor(0.7)).any()
-    # Light that leaves the image is lost, and nothing is added.
     assert image.max() <= 0.7 * (1 + 1e-5)
     assert image[..., 0, 0].max() < 0.65
 

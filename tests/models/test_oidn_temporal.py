@@ -65,15 +65,6 @@ def test_a_still_is_a_mean_of_two_images() -> None:
     torch.testing.assert_close(output.stages["oidn_clean"], clean)
 
 
-def test_features_without_noise_are_not_denoised() -> None:
-    model, oidn = create_model(NAME, threads=1, restore=False), Oidn("high", threads=1)
-    exact = plane().replace(albedo=torch.rand(1, 3, 40, 60))
-    given = Frame(exact.color, albedo=exact.albedo, normal=exact.normal)
-    extra = model.before(exact).extra
-    torch.testing.assert_close(extra[OIDN_CLEAN], inside(oidn.denoised(bordered(given), "clean")))
-    assert torch.equal(extra[OIDN_ALBEDO], exact.albedo)
-
-
 def test_detail_of_a_clean_frame_is_given_back() -> None:
     # Stripes of 17 pixels across a wall whose features do not show them, without noise.
     rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
@@ -167,36 +158,6 @@ def test_weights_written_out_in_float64(centred: float) -> None:
         torch.testing.assert_close(image[0, :, row, column], expected)
 
 
-def test_unchanged_light_has_four_fifths_of_the_previous_result() -> None:
-    frame = given()
-    mean = frame.color
-    # Noise that is gone in the means of any window, and stays in the samples.
-    rows, columns = torch.meshgrid(torch.arange(21), torch.arange(34), indexing="ij")
-    before = mean * (1 + 0.001 * (-1) ** (rows + columns))
-    noisy = mean * (1 + 0.9 * (-1) ** (rows + columns))
-    extra = {**frame.extra, PREVIOUS: before, PREVIOUS_LIGHT: before, NOISY: noisy}
-    image = Steadied()(frame.replace(extra=extra))[0].image
-    torch.testing.assert_close((image - mean) / (before - mean), torch.full_like(mean, 4 / 5), rtol=0.02, atol=0)
-
-
-def test_an_image_of_another_surface_weighs_nothing() -> None:
-    frame = given(weight=0.0)
-    other = frame.replace(extra={**frame.extra, PREVIOUS: torch.full_like(frame.color, 1e4)})
-    assert torch.equal(Steadied()(frame)[0].image, Steadied()(other)[0].image)
-
-
-def test_light_that_has_moved_on_counts_little() -> None:
-    """A highlight of the frame before, which is elsewhere now: the surface is the same, and its light is not."""
-    frame = given(32, 48)
-    now = torch.full_like(frame.color, 0.2)
-    before = now.clone()
-    before[..., 10:16, 10:16] = 5
-    extra = {**frame.extra, NOISY: now, PREVIOUS: before, PREVIOUS_LIGHT: before}
-    image = Steadied()(frame.replace(color=now, extra=extra))[0].image
-    # Otherwise it would be ten parts of 5 in eleven.
-    assert image.max() < 0.2001
-
-
 def test_none_is_asked_of_oidn_for_a_gradient() -> None:
     model = create_model(NAME, threads=1)
     frame = whole_frame(model, 24, 40)
@@ -223,16 +184,6 @@ def test_tiles_are_the_whole_image_which_oidn_sees() -> None:
         frame = whole_frame(whole.model, 200, 330, seed=seed)
         torch.testing.assert_close(tiles(frame), whole(frame), rtol=1e-4, atol=1e-4)
     assert tiles.report.tiles.startswith("6 x 4 tiles")
-
-
-@pytest.mark.parametrize("names", [(), ("albedo",), ("albedo", "normal"), ("normal", "depth"), ("motion",)])
-def test_without_features(names: tuple[str, ...]) -> None:
-    denoiser = Denoiser(create_model(NAME, threads=1))
-    for seed in range(2):
-        frame = whole_frame(denoiser.model, 24, 40, seed=seed)
-        image = denoiser(Frame(frame.color, **{name: frame.buffer(name) for name in names}))
-        assert image.isfinite().all()
-        assert image.min() >= 0
 
 
 def test_a_copy_has_a_library_of_its_own() -> None:

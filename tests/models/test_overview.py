@@ -2,7 +2,6 @@
 
 import json
 import sys
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import get_args
 
@@ -10,7 +9,7 @@ import pytest
 from torch import nn
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import _registry, create_model, list_models, register_model
+from mcdenoise.models import create_model, list_models, register_model
 from mcdenoise.models._entries import Kind
 from mcdenoise.models._overview import overview
 from mcdenoise.models._weights import compared_models, pretrained_models
@@ -66,11 +65,3 @@ def test_a_model_without_its_package_is_listed_with_the_reason(
 def test_a_kind_that_is_none_is_refused() -> None:
     with pytest.raises(ValueError, match=r"kind: .*'magic'"):
         register_model("mine", kind="magic")  # type: ignore[arg-type]
-
-
-def test_a_package_that_cannot_be_loaded_is_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("theirs", "no_such_package:factory", "mcdenoise.models")
-    monkeypatch.setattr(_registry, "_offered", lambda: ({"theirs": point}, []))
-    (entry,) = overview("theirs")
-    assert (entry.kind, entry.weights) == ("other", "none")
-    assert "offers it and cannot load it" in entry.reason

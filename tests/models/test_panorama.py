@@ -29,7 +29,6 @@ def test_the_first_column_may_be_any(model: str) -> None:
         torch.testing.assert_close(turned.image, image.image.roll(80, -1), rtol=1e-3, atol=1e-4)
         assert image.alpha.shape == (1, 1, 40, 160)
         assert all(stage.shape[-1] == 160 for stage in image.stages.values())
-    # Not so without it.
     bare = Denoiser(model), Denoiser(model)
     for number in range(2):
         plain = [

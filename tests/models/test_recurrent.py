@@ -51,7 +51,6 @@ def test_the_previous_image_follows_the_motion() -> None:
     model = Recurrent(inner)
     first = torch.rand(1, 3, 5, 8)
     _, state = model(moving(first, (0, 0)))
-    # Everything was two pixels further left.
     model(moving(torch.rand(1, 3, 5, 8), (-2, 0)), state)
     torch.testing.assert_close(inner.previous[..., 2:], first[..., :-2])
     assert (inner.weight[..., 2:] == 1).all()

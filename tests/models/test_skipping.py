@@ -121,7 +121,6 @@ def test_a_method_of_unknown_reach_runs_and_known_pixels_are_kept() -> None:
     torch.testing.assert_close(images[0][0][..., 90:, :], frames[0].color[..., 90:, :] / 2)
     assert torch.equal(images[0][0][..., :90, :], frames[0].color[..., :90, :])
     assert torch.equal(images[1][0], frames[1].color)
-    # It is asked for the whole image each time.
     assert model.calls == 4
 
 

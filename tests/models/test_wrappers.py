@@ -15,7 +15,6 @@ from mcdenoise.models import (
     Chain,
     Demodulated,
     Exposed,
-    Model,
     Needs,
     Output,
     Restored,
@@ -25,7 +24,6 @@ from mcdenoise.models import (
 )
 from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._interface import prepared
-from mcdenoise.models._wrapper import parts_of
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, remodulate
 
@@ -103,17 +101,6 @@ def test_needs_go_outwards() -> None:
     chain = Chain(first=Blur(), second=inner)
     assert chain.needs == Needs(frozenset({"color", "roughness"}), frozenset({"alpha", "albedo"}), True, 5, 4)
     assert Chain(first=Blur(), second=FromBuffers(double)).needs.reach is None
-
-
-def test_parts_are_found_outermost_first() -> None:
-    inner = Exposed(Same())
-    model = Exposed(Chain(first=inner, second=Demodulated(Exposed(double))))
-    assert next(parts_of(model, Exposed)) is model
-    assert len(list(parts_of(model, Exposed))) == 3
-    assert list(parts_of(model, Chain)) == [model.inner]
-    assert not list(parts_of(model, Skipping))
-    for part in parts_of(model, Wrapper):
-        assert isinstance(part, Model)
 
 
 def test_demodulated_light_contains_no_albedo() -> None:

@@ -49,10 +49,7 @@ def still(color: Tensor, **buffers: Any) -> Frame:
 
 
 def whole_frame(model: Model, height: int, width: int, batch: int = 1, seed: int = 0) -> Frame:
-    """A frame with everything that a model needs or is better with, in range: a wall that moves by half a pixel.
-
-    The seed draws what has noise; the wall is the same.
-    """
+    """A frame with all that a model is better with, in range: a wall that moves half a pixel, and seeded noise."""
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     position = torch.stack([columns / 40, rows / 40, 2 + columns / 400]).repeat(batch, 1, 1, 1)
     depth = position[:, 2:].clone()

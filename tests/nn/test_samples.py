@@ -2,17 +2,12 @@
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import LARGEST_RADIANCE
-from mcdenoise.nn.inputs import image_statistics
 from mcdenoise.nn.samples import LeakyUNet, samples_of
-
-
-def drawn(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("convolutions", [1, 3])
@@ -32,12 +27,6 @@ def test_the_reach_of_a_unet(convolutions: int) -> None:
         farthest = max(farthest, int(columns.abs().max()))
     # Pooled pixels and interpolated ones do not add up to all of the bound in one direction.
     assert reach - 2 * LeakyUNet.multiple <= farthest <= reach
-
-
-def frame(**buffers: Tensor) -> Frame:
-    features = {"albedo": drawn(2, 3, 3, 4), "normal": 2 * drawn(2, 3, 3, 4) - 1, "depth": 1 + drawn(2, 1, 3, 4)}
-    made = Frame(drawn(2, 3, 3, 4, seed=1), **features, **buffers)
-    return made.replace(statistics=image_statistics(made))
 
 
 def test_samples_that_are_no_radiance() -> None:

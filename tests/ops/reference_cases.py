@@ -58,3 +58,6 @@ def every_other_column(tensor: Tensor) -> Tensor:
 
 def transposed(tensor: Tensor) -> Tensor:
     return tensor.transpose(-1, -2).contiguous().transpose(-1, -2)
+
+
+LAYOUTS = (channels_last, slice_of_pixels, every_other_column, transposed)

@@ -8,17 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from reference_cases import (
-    FAST,
-    TOLERANCE,
-    assert_same,
-    by,
-    channels_last,
-    every_other_column,
-    outcomes,
-    slice_of_pixels,
-    transposed,
-)
+from reference_cases import FAST, LAYOUTS, TOLERANCE, assert_same, by, outcomes
 from torch import Generator, Tensor
 
 from mcdenoise import ops
@@ -123,7 +113,7 @@ def test_neither_threads_nor_layout_in_memory_change_a_bit(op: Op, monkeypatch: 
     case = drawn(op, 2, 9, 11)
     for dtype in (torch.float32, torch.bfloat16):
         expected = outcomes(op, case, case.inputs(dtype), "numba")
-        for layout in (channels_last, slice_of_pixels, every_other_column, transposed):
+        for layout in LAYOUTS:
             laid_out = map_tensors(lambda x, lay=layout: (lay if x.ndim == 4 else _cells_apart)(x), case.inputs(dtype))
             assert all(map(torch.equal, outcomes(op, case, laid_out, "numba"), expected)), layout.__name__
     monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
@@ -248,7 +238,7 @@ def test_histories_of_any_layout_and_by_any_number_of_threads(
     inputs = case.inputs()
     limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
     plain = by("torch", op.function)(**inputs, **limits)
-    for layout in (channels_last, slice_of_pixels, every_other_column, transposed):
+    for layout in LAYOUTS:
         for count in (1, 3):
             torch.set_num_threads(count)
             results = by("numba", op.function)(**map_tensors(layout, inputs), **limits)

@@ -104,33 +104,26 @@ class TestEachTap:
             assert weight[0, 0, 0, 0].item() == kept
 
 
-def perspective(batch: int = 1) -> Tensor:
-    """Row vectors: clip x = 2 x, y = 4 y, z = z - 1, w = z."""
-    matrix = torch.zeros(batch, 4, 4, dtype=torch.float64)
-    matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 2, 2], matrix[:, 2, 3], matrix[:, 3, 2] = 2.0, 4.0, 1.0, 1.0, -1.0
-    return matrix
-
-
 def test_points_behind_the_camera_have_no_motion_and_no_history() -> None:
     position = vectors([[(0.0, 0.0, 4.0), (0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (INF, 0.0, 4.0), (NAN, 0.0, 4.0)]])
-    motion = motion_from_position(position, perspective())
+    # Row vectors: clip x and y are those of the point, and w is z.
+    matrix = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64))
+    matrix[2, 3] = 1
+    motion = motion_from_position(position, matrix[None])
     assert motion.isfinite().flatten(2).tolist() == [[[True, False, False, False, False]] * 2]
     _, weight = reproject(draw(1, 1, 1, 5), motion)
     assert weight.flatten().tolist()[1:] == [0.0] * 4
 
 
-class TestNothingMoves:
-    """A motion of ``None`` is a motion of zeros, to the last bit."""
-
-    def test_reprojection_and_its_derivatives(self) -> None:
-        previous, here = draw(1, 3, 5, 6).requires_grad_(), draw(1, 1, 5, 6, seed=1) + 1
-        surfaces = Surface(depth=here), Surface(depth=here * torch.tensor([1.0, 1.5]).repeat(3))
-        expected = reproject(previous, still(5, 6), *surfaces)
-        results = reproject(previous, None, *surfaces)
-        assert all(torch.equal(result, known) for result, known in zip(results, expected, strict=True))
-        slopes = [torch.autograd.grad(value.square().sum(), previous)[0] for value, _ in (results, expected)]
-        assert torch.equal(*slopes)
-        assert results[1].unique().tolist() == [0, 1]
+def test_no_motion_is_one_of_zeros_to_the_last_bit() -> None:
+    previous, here = draw(1, 3, 5, 6).requires_grad_(), draw(1, 1, 5, 6, seed=1) + 1
+    surfaces = Surface(depth=here), Surface(depth=here * torch.tensor([1.0, 1.5]).repeat(3))
+    expected = reproject(previous, still(5, 6), *surfaces)
+    results = reproject(previous, None, *surfaces)
+    assert all(torch.equal(result, known) for result, known in zip(results, expected, strict=True))
+    slopes = [torch.autograd.grad(value.square().sum(), previous)[0] for value, _ in (results, expected)]
+    assert torch.equal(*slopes)
+    assert results[1].unique().tolist() == [0, 1]
 
 
 def test_motion_keeps_its_precision_under_autocast() -> None:

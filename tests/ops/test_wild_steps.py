@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from reference_cases import by, channels_last, every_other_column, slice_of_pixels, transposed
+from reference_cases import LAYOUTS, by
 from torch import Tensor
 
 from mcdenoise.ops._numba import _runtime
@@ -73,7 +73,7 @@ def test_fast_backends_equal_the_reference(size: tuple[int, int, int], dtype: to
         assert_same(results(call, "numba"), results(call, "torch"), TOLERANCE[dtype])
 
 
-@pytest.mark.parametrize("layout", [channels_last, slice_of_pixels, every_other_column, transposed])
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_layout_in_memory_changes_nothing(layout: Callable[[Tensor], Tensor]) -> None:
     size = (2, 5, 70)
     for laid_out, contiguous in zip(calls(size, torch.float32, layout), calls(size, torch.float32), strict=True):
