@@ -8,11 +8,11 @@ from attacker import Attacker, aged, unreadable
 from server import Process
 from table import COMMANDS
 
+pytestmark = [pytest.mark.attack, pytest.mark.timeout(1800)]
+
 KILLED = {"denoise": 18, "denoise layers": 9, "denoise again": 9, "film": 9, "film again": 6, "train": 6}
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("name", "count"), KILLED.items())
 def test_killed(attacker: Attacker, name: str, count: int) -> None:
     """No incomplete file has a final name, and the result of running the command again is as without the kill."""
@@ -33,8 +33,6 @@ def test_killed(attacker: Attacker, name: str, count: int) -> None:
     assert not failed, "\n".join(failed)
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("name", "count"), KILLED.items())
 def test_two_at_once(attacker: Attacker, name: str, count: int) -> None:
     """Two runs in one folder: each succeeds or is rejected in one line, and the final files are complete."""

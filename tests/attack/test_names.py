@@ -9,6 +9,8 @@ import pytest
 from attacker import Attacker
 from table import COMMANDS, SLOW
 
+pytestmark = [pytest.mark.attack, pytest.mark.timeout(1800)]
+
 # Among them a user that there is not: ~ alone is the own folder.
 NAMES = [
     *("with space", "line\nbreak", "\x1b[2J\x1b[31mred", "M\udcfcller", "\udcff\udcfe", "-o", "--json"),
@@ -38,8 +40,6 @@ GIVEN = {
 EVERY = [(part, command) for part, commands in GIVEN.items() for command in commands]
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("part", "name"), EVERY)
 def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> None:
     failed, command = [], COMMANDS[name]
@@ -76,8 +76,6 @@ def test_names_on_the_command_line(attacker: Attacker, part: str, name: str) -> 
     assert not failed, "\n".join(failed)
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["denoise", "denoise layers", "inspect", "evaluate", "train"])
 def test_names_that_are_found(attacker: Attacker, name: str) -> None:
     """Files, folders and links with such names, beside the files that are read."""

@@ -1,7 +1,6 @@
 """Outputs that exist already or cannot be written to, and full disks."""
 
 import os
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,8 @@ import pytest
 from attacker import Attacker, names, of_lines, unreadable
 from mutations import PLACES
 from table import COMMANDS, SLOW
+
+pytestmark = [pytest.mark.attack, pytest.mark.timeout(1800)]
 
 NOBODY = 65534
 
@@ -56,8 +57,6 @@ LINES = {
 }
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("command", LINES)
 def test_existing_outputs(attacker: Attacker, command: str) -> None:
     """Inputs are never overwritten, under any name, and outputs are rejected before any frame is denoised."""
@@ -83,8 +82,6 @@ def test_existing_outputs(attacker: Attacker, command: str) -> None:
     assert not failed, "\n".join(failed)
 
 
-@pytest.mark.attack
-@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("name", ["denoise", "denoise layers", "denoise again", "film", "train"])
 def test_full_disk(attacker: Attacker, name: str) -> None:
     """With a limited file size no incomplete files are left, and running again without the limit succeeds."""
@@ -103,28 +100,6 @@ def test_full_disk(attacker: Attacker, name: str) -> None:
     assert not failed, "\n".join(failed)
 
 
-@pytest.mark.attack
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
-@pytest.mark.parametrize("name", ["denoise", "denoise layers", "film"])
-def test_a_small_disk(attacker: Attacker, name: str) -> None:
-    failed, command = [], COMMANDS[name]
-    for options in ("ro", *(f"size={kilobytes}k" for kilobytes in (4, 8, 12, 16, 24, 32))):
-        folder = attacker.fresh(command.needs)
-        out = folder / command.out.split("/")[0]
-        out.mkdir()
-        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(out)]
-        if subprocess.run(mount, capture_output=True, check=False).returncode:
-            pytest.skip("may not mount")
-        try:
-            ended = attacker.run(command.command, folder)
-            problem = attacker.judge(name, folder, ended, same=True)
-        finally:
-            subprocess.run(["umount", str(out)], check=True)
-        failed += attacker.count("outputs", problem, f"{name}, {options}", folder)
-    assert not failed, "\n".join(failed)
-
-
-@pytest.mark.attack
 @pytest.mark.skipif(os.geteuid() != 0, reason="takes the rights of another user")
 @pytest.mark.parametrize("name", ["denoise", "denoise again", "denoise layers", "train", "report", "inspect"])
 def test_a_folder_of_another_user(attacker: Attacker, name: str) -> None:
