@@ -19,7 +19,6 @@ def run(*arguments: object, encoding: str = "utf-8") -> tuple[int, str, str]:
 
 
 def succeeds(*arguments: object) -> str:
-    """What a command prints that must succeed."""
     status, printed, said = run(*arguments)
     assert status == 0, said
     return printed

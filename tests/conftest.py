@@ -37,7 +37,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def colour() -> Any:
-    """The package colour-science."""
     return import_colour()
 
 
@@ -54,13 +53,11 @@ def seed() -> Iterator[None]:
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """A folder to write to, which is not there yet."""
     return tmp_path / "out"
 
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """A file of the weights of a small model."""
     path = tmp_path / "small.safetensors"
     path.write_bytes(save_weights(small_model(), "cascaded", {"width": 8}, {}))
     return path

@@ -15,11 +15,7 @@ HEIGHT, WIDTH = 40, 60
 
 
 def plane(offsets: Tensor | None = None) -> Frame:
-    """A plane with random color, whose inverse depth is linear in the image.
-
-    Args:
-        offsets: ``(2, HEIGHT, WIDTH)``, points of the pixels through which it is seen; by default their centres.
-    """
+    """A plane with random color, whose inverse depth is linear in the image; offsets are from pixel centres."""
     rows, columns = torch.meshgrid(torch.arange(float(HEIGHT)), torch.arange(float(WIDTH)), indexing="ij")
     across, down = torch.zeros(2, 1, 1) if offsets is None else offsets
     inverse = 0.2 + 0.004 * (columns + across) + 0.003 * (rows + down)
@@ -28,14 +24,7 @@ def plane(offsets: Tensor | None = None) -> Frame:
 
 
 def leaning_wall(number: int, width: int, height: int, step: float = 1.0) -> dict[str, Tensor]:
-    """Features of a wall whose depths and positions differ from pixel to pixel, and its camera, which moves along it.
-
-    Args:
-        number: of the frame.
-        width: in pixels.
-        height: in pixels.
-        step: how far the camera moves from frame to frame; 0 before a still wall.
-    """
+    """Features of a wall, with depths that differ from pixel to pixel, and its camera, which moves along it."""
     eye = torch.tensor([0.03, 0.02, 0.0]) * number * step
     rows, columns = torch.arange(height).float(), torch.arange(width).float()
     ray = torch.ones(3, height, width)

@@ -7,7 +7,6 @@ from mcdenoise import create_model
 
 
 def small_model() -> nn.Module:
-    """The paper's cascade of width 8 with random weights."""
     torch.manual_seed(0)
     model = create_model("cascaded", width=8)
     assert isinstance(model, nn.Module)

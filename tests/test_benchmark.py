@@ -61,7 +61,6 @@ def run(*arguments: Any) -> tuple[int, str, str]:
 
 
 def half() -> Model:
-    """A model that returns half of the accumulated light."""
     return Demodulated(Accumulated(lambda color: color / 2))
 
 
@@ -93,7 +92,6 @@ def unmakeable() -> Model:
 
 
 def own(name: str, factory: str, **settings: Any) -> Method:
-    """A method defined in this file."""
     return Method(name, "fixed", name.replace(" ", "-"), f"{__name__}:{factory}", settings)
 
 
@@ -187,7 +185,6 @@ def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: 
     for cell in results.cells:
         assert bool(cell.failure) is not bool(cell.errors)
         assert bool(cell.failure) is (cell.whole is None)
-    # Images of a method before it failed are removed.
     assert sorted(path.name for path in (out / "images" / "plane").iterdir()) == ["fine", "reference"]
     assert Results.read(out) == results
 
@@ -272,7 +269,6 @@ def test_missing_methods_are_listed_as_missing(
     line = f"missing: {'; '.join(missing)}: {results.methods[4].missing}"
     assert printed.splitlines()[-3:] == [line, results.notes[0], f"report: {out / 'index.html'}"]
 
-    # results.csv contains the same numbers.
     with (out / "results.csv").open(newline="") as text:
         rows = list(csv.DictReader(text))
     assert [row["method"] for row in rows] == [method.name for method in results.methods]

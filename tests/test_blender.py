@@ -65,7 +65,6 @@ def test_buffers_are_read_as_by_the_package(shot: str, frames: Any, tmp_path: Pa
 
 
 def parts(path: Path) -> dict[str, Any]:
-    """Pixels of every channel of every part."""
     file, found = oiio.ImageInput.open(str(path)), {}
     while file.seek_subimage(file.current_subimage() + bool(found), 0):
         pixels = file.read_image(file.current_subimage(), 0, 0, file.spec().nchannels, "float")

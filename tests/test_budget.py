@@ -38,7 +38,6 @@ def sequence(small_sequence: Path) -> Sequence:
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    """A benchmark over two scenes."""
     errors = {"wild_large": 0.05, "wild_large, bfloat16": 0.052, "wild": 0.06, "wild_small": 0.08}
     cells = [
         Cell(scene, name, {"SMAPE": error + shift})

@@ -104,7 +104,6 @@ def test_texture_coordinates_are_those_of_mitsuba() -> None:
         mesh = tessellate(kind)
         points, uv = mesh.vertices[mesh.triangles], mesh.uv
         turn = uv[..., angle] - np.arctan2(points[..., 1], points[..., 0]) / (2 * math.pi)
-        # At the axis there is no angle.
         away = np.hypot(points[..., 0], points[..., 1]) > 1e-9
         np.testing.assert_allclose(turn[away], np.rint(turn[away]), atol=1e-12)
     sphere, cylinder, disk = (tessellate(kind) for kind in ("sphere", "cylinder", "disk"))
@@ -188,7 +187,6 @@ def test_what_cycles_cannot_be_given_is_named(entry: dict[str, Any]) -> None:
 
 
 def passes(height: int, width: int) -> dict[str, Any]:
-    """Return the passes of a frame in which nothing was hit."""
     return {
         "Combined": np.ones((height, width, 3), np.float32),
         "Denoising Albedo": np.zeros((height, width, 3), np.float32),

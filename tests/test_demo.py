@@ -52,7 +52,6 @@ def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").glob("*.exr")}
     assert len(files) == 3 * 5 + 2
     report = result.page.stat().st_mtime_ns
-    # All methods were compared already; what is used again is of none of them.
     monkeypatch.setattr(small_demo, "COMPARED", "none")
     again = small_demo.run_demo(tmp_path)
     assert again.page.stat().st_mtime_ns > report

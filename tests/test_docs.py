@@ -34,7 +34,6 @@ def blocks(page: Path | str, language: str) -> list[str]:
 
 
 def commands(path: Path) -> list[str]:
-    """Lines of shell blocks that start `mcdenoise`, with their continuations."""
     shell = blocks(path, "(?:sh)?")
     lines = [line.strip() for block in shell for line in block.replace("\\\n", "").splitlines()]
     return [line for line in lines if line.startswith("mcdenoise ")]

@@ -56,7 +56,6 @@ def run(name: str, *arguments: Path | str) -> str:
 
 
 def errors(line: str) -> list[tuple[float, float]]:
-    """SMAPE and PSNR of each image in one line of compose_denoiser.py."""
     return [(float(smape), float(psnr)) for smape, psnr in re.findall(r"([\d.]+)\s+([\d.]+) dB", line)]
 
 
@@ -110,7 +109,6 @@ def test_gradcheck_passes() -> None:
 
 
 def fitted(printed: str) -> tuple[list[float], float, float]:
-    """The printed losses, and the held-out error before and after."""
     losses = [float(value) for value in re.findall(r"^step +\d+ +SMAPE ([\d.]+)$", printed, re.MULTILINE)]
     held_out = re.search(r"held-out SMAPE +before ([\d.]+) +after ([\d.]+)", printed)
     assert held_out
@@ -156,7 +154,6 @@ def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
     for number in range(2):
         frame = found.frame(number)
         frame.validate()
-        # The scene is lit and visible.
         assert (frame.color > 0).float().mean() > 0.2
         depth = frame.with_depth().depth
         assert depth.isfinite().float().mean() > 0.5
@@ -164,7 +161,6 @@ def test_a_scene_renders(folder: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def dataset(small_sequence: Path) -> Path:
-    """Three scenes, two of which are versions of one."""
     for name in ("hall", "hall-glossy", "yard"):
         shutil.copytree(small_sequence, small_sequence.parent / "dataset" / name)
     return small_sequence.parent / "dataset"

@@ -183,7 +183,6 @@ class Mean(nn.Module):
 
 @pytest.fixture
 def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the graph model.onnx, and in which Python is."""
     for package in ("onnxscript", "onnxruntime"):
         pytest.importorskip(package, reason="graphs in ONNX need the extra mcdenoise[export]")
     monkeypatch.chdir(tmp_path)

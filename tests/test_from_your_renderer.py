@@ -45,7 +45,6 @@ def blocks(section: str, language: str) -> list[str]:
 
 
 def rows(count: int) -> list[list[str]]:
-    """Rows of the tables with so many columns."""
     lines = [line.strip("| ").split("|") for line in PAGE.read_text().splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line] for line in lines if len(line) == count]
 

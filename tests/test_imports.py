@@ -20,15 +20,7 @@ MODULES = {
 # The table of rooms names what each room (a module or folder right below mcdenoise/) may import besides itself. The
 # test fails for a room that is not in it: place it deliberately.
 SIGNAL = {"buffers", "errors", "frame", "light", "motion", "noise", "ops", "reading", "sampling"}
-LIBRARY = SIGNAL | {
-    "metrics",
-    "nn",
-    "models",
-    "data",
-    "scenes",
-    "denoiser",
-    "sequence_report",
-}
+LIBRARY = SIGNAL | {"metrics", "nn", "models", "data", "scenes", "denoiser", "sequence_report"}
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
 TOOLS = REPORTS | {"budget", "demo", "export", "film", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
@@ -114,7 +106,6 @@ def imported(module: str, source: str) -> Iterator[str]:
 
 
 def arrows(module: str, source: str) -> Iterator[str]:
-    """Imports of a module that the table forbids."""
     room = room_of(module)
     for name in imported(module, source):
         outermost = name.partition(".")[0]
@@ -133,7 +124,6 @@ def files_of(room: str) -> dict[str, set[str]]:
 
 
 def circles(graph: dict[str, set[str]]) -> list[str]:
-    """A circle among the imports of a graph, or nothing."""
     # A package holds the files below it: what they import of it is what it has imported of others before.
     inside = {file: {other for other in others if not file.startswith(f"{other}.")} for file, others in graph.items()}
     try:
@@ -144,7 +134,6 @@ def circles(graph: dict[str, set[str]]) -> list[str]:
 
 
 def is_page(module: str) -> bool:
-    """Whether a file of ops holds an op."""
     *folders, name = module.split(".")
     return folders in (["mcdenoise", "ops"], ["mcdenoise", "ops", "_steps"]) and not name.startswith("_")
 

@@ -103,10 +103,7 @@ def started(code: str, *arguments: object, folder: Path) -> subprocess.Popen[str
 
 
 def end(process: subprocess.Popen[str], number: signal.Signals, name: str, lines: int = -1) -> None:
-    """Send a signal to a command and all its processes, as a terminal does, and see how they end.
-
-    One that has printed all its lines may have come to its end before.
-    """
+    """Send a signal to a command and all its processes; one that has printed all its lines may have ended."""
     with process:
         os.killpg(process.pid, number)
         start = time.monotonic()

@@ -65,7 +65,6 @@ def differentiates() -> str:
 
 @pytest.fixture
 def ad(mi: Any, differentiates: str) -> Any:
-    """Mitsuba in a variant that differentiates."""
     if differentiates:
         pytest.skip(differentiates)
     mi.set_variant("llvm_ad_rgb")
@@ -248,7 +247,6 @@ def test_gradients_are_those_of_torch(ad: Any) -> None:
         assert largest > 0
         # The same operations in float32; sums of threads may be added in another order.
         np.testing.assert_allclose(found, expected[name], rtol=0, atol=1e-4 * largest)
-    # Nothing is left in the weights.
     assert all(each.grad is None for each in denoiser.denoiser.model.parameters())
 
 
@@ -337,15 +335,8 @@ def test_arguments_that_do_not_fit_are_told_in_one_line(mi: Any) -> None:
 
 @pytest.mark.parametrize("missing", ["mitsuba", "drjit"])
 def test_without_mitsuba_one_line_says_what_to_install(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = importlib.import_module
-
-    def refuse(name: str, package: str | None = None) -> Any:
-        if name == missing:
-            raise ImportError(name)
-        return original(name, package)
-
     if missing == "drjit":
         pytest.importorskip("mitsuba")
-    monkeypatch.setattr(importlib, "import_module", refuse)
+    monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(InputError, match=rf"{missing}.*mcdenoise\[render\]"):
         MitsubaDenoiser((WIDTH, HEIGHT))

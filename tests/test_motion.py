@@ -19,14 +19,7 @@ HEIGHT, WIDTH, FRAMES = 72, 96, 3
 def shot(
     *, speed: tuple[float, float] = (0.12, 0.05), noise: float = 0.3, sky: bool = False, ball: float = 0.0
 ) -> Iterator[Frame]:
-    """A leaning wall with a pattern, seen by a camera that moves; perhaps with a sky, and a square that moves.
-
-    Args:
-        speed: of the camera, to the right and down.
-        noise: of albedo and color, as of one sample a pixel.
-        sky: whether nothing is hit in the upper third.
-        ball: speed of a square before the wall.
-    """
+    """A leaning wall with a pattern, seen by a camera that moves; perhaps with a sky, and a square that moves."""
     g = torch.Generator().manual_seed(0)
     texture = torch.rand(1, 3, 32, 32, generator=g)
     rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
@@ -64,7 +57,6 @@ def shot(
 
 
 def told(frames: list[Frame]) -> list[str]:
-    """What is doubted of each frame."""
     seen = [None, *(seen_in(frame) for frame in frames)]
     return [doubt_motion(frame, before) for frame, before in zip(frames, seen, strict=False)]
 

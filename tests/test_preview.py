@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from commands import refuses, succeeds
-from torch import Tensor
 
 from mcdenoise.data import read_exr
 from mcdenoise.data.png import Picture, read_png
@@ -20,10 +19,6 @@ def code(radiance: float) -> int:
     """8-bit code of a radiance by IEC 61966-2-1, written out."""
     x = min(max(radiance, 0.0), 1.0)
     return round(255 * (12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055))
-
-
-def constant(radiance: float, height: int = 20, width: int = 24) -> Tensor:
-    return torch.full((1, 3, height, width), radiance)
 
 
 def shown(folder: Path, name: str) -> Picture:
@@ -53,7 +48,7 @@ def test_codes_are_those_of_the_curve(tmp_path: Path, stops: float) -> None:
 def test_the_first_frame_that_is_not_black_decides_the_exposure_of_all(tmp_path: Path) -> None:
     preview = Preview(tmp_path, video=False)
     for name, radiance in {"a": 0.0, "b": 2.0, "c": 4.0, "d": 1.0, "e": 0.0}.items():
-        preview.add(name, constant(radiance))
+        preview.add(name, torch.full((1, 3, 20, 24), radiance))
     codes = [int(shown(tmp_path, name)[0, 0, 0]) for name in "abcde"]
     assert codes == [0, code(0.18), code(0.36), code(0.09), 0]
 
@@ -116,7 +111,6 @@ def test_the_command_line_refuses_before_it_denoises(
     monkeypatch.setitem(sys.modules, "av", None)
     assert "mcdenoise[preview]" in refuses(f"{command} --preview")
     assert not out.exists()
-    # A still needs no package.
     succeeds(f"{command} --preview --frames 1")
 
 

@@ -37,12 +37,6 @@ def denoised(method: str, frames: list[Frame]) -> list[tuple[Tensor, Any]]:
     return found
 
 
-def assert_alike(found: list[tuple[Tensor, Any]], expected: list[tuple[Tensor, Any]]) -> None:
-    for (image, report), (same, own) in zip(found, expected, strict=True):
-        torch.testing.assert_close(image, same, rtol=1e-5, atol=1e-6)
-        assert report == own
-
-
 def together(*actions: Callable[[], Any]) -> list[Any]:
     """Results of functions that begin at the same time, each in a thread of its own."""
     barrier = threading.Barrier(len(actions))
@@ -61,7 +55,9 @@ def test_denoisers_in_two_threads_are_those_alone(pair: tuple[int, int]) -> None
     tasks = [(METHODS[pair[0]], shot(1)), (METHODS[pair[1]], shot(2, 40, 48, frames=9))]
     alone = [denoised(*task) for task in tasks]
     for found, expected in zip(together(*(lambda task=task: denoised(*task) for task in tasks)), alone, strict=True):
-        assert_alike(found, expected)
+        for (image, report), (same, own) in zip(found, expected, strict=True):
+            torch.testing.assert_close(image, same, rtol=1e-5, atol=1e-6)
+            assert report == own
 
 
 def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:

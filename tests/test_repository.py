@@ -51,7 +51,6 @@ def test_files_are_small(files: list[Path]) -> None:
 
 
 def text_of(path: Path) -> str:
-    """The text of a file, empty for a binary one."""
     data = path.read_bytes()
     if b"\0" in data:
         return ""
@@ -78,7 +77,6 @@ def test_weights_are_small_and_no_pickles(files: list[Path]) -> None:
 
 
 def unpicklers(source: str) -> list[str]:
-    """Lines of Python source that can read a pickle."""
     nodes = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.stmt | ast.expr))
     return [f"{node.lineno}: {ast.unparse(node)}" for node in nodes if reads_pickles(node)]
 

@@ -30,16 +30,7 @@ def results() -> Results:
         ],
         cells=[
             Cell("plane", "noisy", failure="it broke"),
-            Cell(
-                "plane",
-                "ours",
-                {"SMAPE": 0.1},
-                {"SMAPE": SPREAD},
-                SPREAD,
-                {"read": SPREAD},
-                5.0,
-                computing=SPREAD,
-            ),
+            Cell("plane", "ours", {"SMAPE": 0.1}, {"SMAPE": SPREAD}, SPREAD, {"read": SPREAD}, 5.0, computing=SPREAD),
         ],
         costs=[Cost("ours", 10, 20, SPREAD), Cost("ours", 1000, 2000, failure="too little memory")],
         fits=[Fit("ours", 1.0, 2.0, 0.1)],
@@ -47,16 +38,10 @@ def results() -> Results:
     )
 
 
-def test_written_files_are_read_back(results: Results, tmp_path: Path) -> None:
-    results.write(tmp_path)
-    assert Results.read(tmp_path) == results
-
-
 HOSTILE: list[Any] = [None, True, -1, 1e300, "../..", "\x1b[2J", []]
 
 
 def places(content: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Yield the path of everything in the content of a JSON file, the content itself excepted."""
     items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     for key, value in items:
         yield (*path, key)
@@ -73,7 +58,6 @@ def changed(content: Any, path: tuple[Any, ...], change: Callable[[Any, Any], No
 
 
 def damaged(content: Any) -> Iterator[Any]:
-    """Yield the content with one thing replaced, gone, or twice."""
     for path in places(content):
         for value in HOSTILE:
             yield changed(content, path, lambda holder, key, value=value: holder.__setitem__(key, value))

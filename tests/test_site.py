@@ -17,7 +17,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def site() -> ModuleType:
-    """The generators of the pages, which need no package of the site."""
     sys.path.insert(0, str(ROOT / "docs" / "site"))
     yield importlib.import_module
     sys.path.remove(str(ROOT / "docs" / "site"))

@@ -25,7 +25,6 @@ def read(path: Path) -> NDArray[Any]:
 
 @pytest.fixture
 def buffers(tmp_path: Path) -> dict[str, NDArray[Any]]:
-    """Buffers in files of names that tell nothing."""
     rng = np.random.default_rng(0)
     albedo = np.where(np.arange(SIZE[1]) < 16, 0.2, 0.8)[None, :, None] * np.ones((*SIZE, 3))
     normal = np.broadcast_to(np.float32([0.6, 0, -0.8]), (*SIZE, 3))

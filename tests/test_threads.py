@@ -13,7 +13,6 @@ SAID = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
 
 
 def policies(**own: str) -> dict[str, str]:
-    """Return the settings of OpenMP in a process that runs a command."""
     environment = {name: value for name, value in os.environ.items() if name not in SAID}
     environment |= {"OMP_DISPLAY_ENV": "VERBOSE", **own}
     command = [sys.executable, "-m", "mcdenoise", "evaluate", "--help"]

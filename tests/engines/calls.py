@@ -6,13 +6,11 @@ from pathlib import Path
 
 
 def mark(folder: Path, name: str) -> str:
-    """Write a file and return its name."""
     (folder / name).write_text(str(os.getpid()))
     return name
 
 
 def die_at_first(folder: Path, name: str, times: int = 1) -> str:
-    """Kill this process so many times before the task succeeds."""
     tries = sorted(folder.glob(f"{name}.try*"))
     if len(tries) < times:
         mark(folder, f"{name}.try{len(tries)}")
@@ -21,7 +19,6 @@ def die_at_first(folder: Path, name: str, times: int = 1) -> str:
 
 
 def fail(message: str) -> None:
-    """Raise an error that no input causes."""
     raise RuntimeError(message)
 
 
@@ -33,5 +30,4 @@ class Strange(Exception):
 
 
 def fail_strangely() -> None:
-    """Raise such an error."""
     raise Strange(7, 8)

@@ -32,8 +32,6 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def lose(cluster: Any, out: Path, pattern: str) -> threading.Thread:
-    """Remove a node as soon as there is something of that name."""
-
     def wait() -> None:
         while not list(out.glob(pattern)):
             time.sleep(0.02)
@@ -45,7 +43,6 @@ def lose(cluster: Any, out: Path, pattern: str) -> threading.Thread:
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether two folders hold the same images, bit by bit."""
     images = [{path.relative_to(each): read_exr(path)[0] for path in each.rglob("*.exr")} for each in (one, other)]
     equal = all(np.array_equal(image, images[1].get(path)) for path, image in images[0].items())
     return bool(images[0]) and images[0].keys() == images[1].keys() and equal

@@ -26,8 +26,6 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Run:
-    """Tasks with names, and what came of them."""
-
     def __init__(self) -> None:
         self.answers: dict[str, object] = {}
         self.failed: dict[str, str] = {}
@@ -80,7 +78,6 @@ def test_a_driver_of_another_version_is_refused() -> None:
 
 
 def kill_children() -> int:
-    """Kill every process that this one has started, whatever it is for, and return how many there were."""
     found: list[int] = []
     for path in Path("/proc/self/task").glob("*/children"):
         # A thread may end while it is read, and a process before it is killed.

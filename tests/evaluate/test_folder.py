@@ -28,7 +28,6 @@ def touched(folder: Path, *names: str) -> Path:
 
 @pytest.fixture
 def images(small_sequence: Path, tmp_path: Path) -> Path:
-    """A folder with the noisy colors as its images."""
     out = tmp_path / "out"
     out.mkdir()
     for number in range(4):

@@ -14,13 +14,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Needs, Output
 
 
-def same(color: Tensor) -> Tensor:
-    return color
-
-
 class Counting:
-    """Counts the frames of a shot."""
-
     needs = Needs(trainable=False)
 
     def __init__(self) -> None:
@@ -38,7 +32,7 @@ def sequence(small_sequence: Path) -> Sequence:
 
 
 def test_the_errors_are_those_of_the_files_that_would_be_written(sequence: Sequence, tmp_path: Path) -> None:
-    denoiser = Denoiser(Accumulated(same))
+    denoiser = Denoiser(Accumulated(lambda color: color))
     denoise_sequence(sequence, tmp_path / "out", denoiser, "accumulated", full_float=True)
     written = evaluate_folder(sequence, tmp_path / "out", protocol="meng2020")
     found = evaluate_method(sequence, denoiser, "accumulated", protocol="meng2020")

@@ -44,7 +44,6 @@ class Inline:
 
 
 def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, seed: int = 0) -> Path:
-    """Frames of one shot, in the BMFR layout."""
     inputs = folder / "inputs"
     walls = [leaning_wall(number, width, height) for number in range(frames)]
     matrices = np.concatenate([wall["view_projection"].double().numpy() for wall in walls])
@@ -66,7 +65,6 @@ def frame(number: int, width: int, height: int, seed: int) -> Frame:
 
 
 def write_manifest(path: Path, shots: dict[str, Path], **every: object) -> Path:
-    """A manifest of shots, with settings of all."""
     lines = ["[every]", *(f"{key} = {_toml(value)}" for key, value in every.items())]
     for name, folder in shots.items():
         lines += ["[[shot]]", f"name = {_toml(name)}", f"input = {_toml(str(folder))}"]
@@ -79,17 +77,14 @@ def _toml(value: object) -> str:
 
 
 def edit(path: Path) -> None:
-    """Render a frame again: other pixels, in a file of the same size."""
     image, channels, _ = read_exr(path)
     write_exr(path, image * 1.5, channels, full_float=True)
 
 
 def pixels(folder: Path) -> dict[str, np.ndarray]:
-    """Return the pixels of every image in a folder."""
     return {path.name: read_exr(path)[0] for path in sorted(folder.glob("*.exr"))}
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether two folders hold the same images, bit by bit."""
     a, b = pixels(one), pixels(other)
     return a.keys() == b.keys() and bool(a) and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)

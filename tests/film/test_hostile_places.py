@@ -22,7 +22,6 @@ NAMES = ["with space", "line\nbreak", "🎬 ünï", "[a]", "%s", "--ray", "\x1b[
 def film(
     folder: Path, *arguments: object, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """The command, in a process of its own that works in a folder."""
     command = [sys.executable, "-m", "mcdenoise", "film", *map(str, arguments), "--model", "accumulated"]
     paths = [str(folder / "site"), str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
     environment = {"PATH": os.environ["PATH"], "PYTHONPATH": ":".join(filter(None, paths)), **(environment or {})}

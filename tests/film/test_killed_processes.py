@@ -16,11 +16,6 @@ from mcdenoise.film import read_film, run_film
 SECONDS = 240.0
 
 
-def workers_of(process: int) -> list[int]:
-    """The processes that a process has started."""
-    return [int(each) for path in Path(f"/proc/{process}/task").glob("*/children") for each in path.read_text().split()]
-
-
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(tmp_path: Path) -> None:
@@ -36,16 +31,15 @@ def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(tmp_path: 
         assert first.poll() is None, first.communicate()
         assert time.monotonic() < until
         time.sleep(0.02)
-    # A second one says so, and stops.
     assert refuses("film", manifest, "-o", out).startswith(f"mcdenoise film: {out}/.film: ")
-    workers = workers_of(first.pid)
+    children = Path(f"/proc/{first.pid}/task").glob("*/children")
+    workers = [int(each) for path in children for each in path.read_text().split()]
     assert workers
     first.kill()
     first.communicate()
     while any(Path(f"/proc/{worker}").exists() for worker in workers):
         assert time.monotonic() < until
         time.sleep(0.05)
-    # A file with its final name is whole.
     assert 3 <= len(pixels(out / "s")) <= 60
     kept = {path: path.stat().st_mtime_ns for path in (out / ".film/s").glob("*.json")}
     assert 3 <= len(kept) < 60

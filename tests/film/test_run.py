@@ -55,7 +55,6 @@ def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> 
         for number, about in alone["frames"].items():
             own = film["frames"][number]
             assert {**own, "milliseconds": 0, "beside": 0} == {**about, "milliseconds": 0, "beside": 0}
-    # Nothing else is there.
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".film", "film.json", "film_pictures", *shots}
 
 
@@ -103,7 +102,6 @@ def test_changed_frames_are_made_again(
 
 
 def written(out: Path) -> dict[int, int]:
-    """When each frame was written."""
     return {number: (out / f"s1/denoised{number}.exr").stat().st_mtime_ns for number in range(5)}
 
 

@@ -35,7 +35,6 @@ def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
         assert time.monotonic() < until
         time.sleep(0.002)
     end(process, number, "film", lines=2)
-    # A file with its final name is whole, and no other file is left.
     pixels(out / "s")
     if phase == "middle":
         assert not json.loads((out / "film.json").read_text())["complete"]

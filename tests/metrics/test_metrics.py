@@ -70,7 +70,6 @@ def test_psnr_written_out() -> None:
 
 
 def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A noisy image with highlights and its smooth reference, ``(1, 3, H, W)``."""
     torch.manual_seed(0)
     y, x = torch.meshgrid(torch.linspace(0, 3, height), torch.linspace(0, 5, width), indexing="ij")
     reference = torch.stack([0.5 + 0.5 * torch.sin(x + y), 0.4 + 0.3 * torch.cos(2 * x), 0.3 * y])[None]

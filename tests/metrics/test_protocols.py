@@ -15,7 +15,6 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """A noisy image with highlights and its smooth reference, ``(1, 3, H, W)``, double precision."""
     generator = torch.Generator().manual_seed(0)
     y, x = torch.meshgrid(torch.linspace(0, 3, height), torch.linspace(0, 5, width), indexing="ij")
     reference = torch.stack([0.6 + 0.6 * torch.sin(x + y), 0.4 + 0.3 * torch.cos(2 * x), 0.3 * y])[None].double()
@@ -24,7 +23,6 @@ def pair(height: int, width: int) -> tuple[Tensor, Tensor]:
 
 
 def arrays(*images: Tensor) -> list[Array]:
-    """``(H, W, 3)``"""
     return [image[0].permute(1, 2, 0).numpy() for image in images]
 
 
@@ -37,7 +35,6 @@ def legacy_gamma(image: Array) -> Array:
 
 
 def eight_bits(shown: Array) -> Array:
-    """Values as stored in an 8-bit PNG."""
     return np.clip(shown * 255.0 + 0.5, 0, 255).astype(np.uint8) / 255.0
 
 
@@ -53,7 +50,6 @@ def test_psnr_and_ssim_of_old_are_those_of_scikit_image(protocol: ProtocolName) 
     expected = metrics.structural_similarity(truth, test, channel_axis=2, data_range=2)
     assert 0.1 < expected < 0.9
     assert found["SSIM"] == pytest.approx(expected, rel=1e-9)
-    # Half of that range would give lower values.
     assert found["SSIM"] > metrics.structural_similarity(truth, test, channel_axis=2, data_range=1) + 0.02
 
 

@@ -29,7 +29,6 @@ def moving(pattern: Tensor, by: int) -> Tensor:
 
 
 def motion(by: float, height: int, width: int) -> Tensor:
-    """Motion of a pattern that has moved to the right."""
     return torch.tensor([-by, 0.0], dtype=torch.float64).reshape(1, 2, 1, 1).expand(1, 2, height, width)
 
 

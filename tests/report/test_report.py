@@ -116,12 +116,8 @@ def test_more_pictures_are_coarser_and_then_smaller(folder: Path, monkeypatch: p
     assert told[0][2] > told[1][2] > told[2][2]
 
 
-def copied(folder: Path, target: Path) -> Path:
-    return shutil.copytree(folder, target, ignore=shutil.ignore_patterns("plots", "index.html"))
-
-
 def test_pictures_of_another_size(folder: Path, tmp_path: Path):
-    copy = copied(folder, tmp_path / "copy")
+    copy = shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("plots", "index.html"))
     save(copy, "first", "ours", FRAMES[0], np.zeros((8, 8, 3), np.float32))
     with pytest.raises(InputError, match=r"ours.3\.exr: .*3 channels of 8x8"):
         report_writing._galleries(copy, Results.read(copy))

@@ -46,7 +46,6 @@ def without_images(value: Any) -> Any:
 
 
 def digest(seed: int, frames: int = FRAMES) -> str:
-    """Return the digest of everything that a scene consists of."""
     made = drawn(seed, frames)
     numbers = np.array([[*camera.to_world.ravel(), camera.fov_x] for camera in made.cameras])
     parts = (scene_digest(made.scene), scene_digest({"cameras": numbers}), scene_digest(made.moves))
@@ -58,7 +57,6 @@ def poses(shot: list[Camera]) -> list[list[Any]]:
 
 
 def entries(value: Any) -> Iterator[dict[str, Any]]:
-    """Every dictionary in a scene, nested ones too."""
     if isinstance(value, dict):
         yield value
         for item in value.values():

@@ -42,7 +42,6 @@ def test_rows_are_chosen_by_patterns() -> None:
 
 @pytest.fixture
 def two_shots(monkeypatch: pytest.MonkeyPatch) -> list[Shot]:
-    """Two shots of the same picture, with one and with two samples per pixel."""
     shots = [Shot(f"tiny-{n}", "mitsuba", "parlour", n, "box", **TINY) for n in (1, 2)]
     monkeypatch.setattr(rendering, "SHOTS", tuple(shots))
     return shots

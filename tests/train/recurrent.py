@@ -22,7 +22,6 @@ class Recurrent(nn.Module):
         self.head = nn.Conv2d(width, 3, 1)
 
     def forward(self, frame: Frame, state: Tensor | None = None) -> tuple[Output, Tensor]:
-        """See :class:`mcdenoise.models.Model`."""
         image = torch.log1p(frame.color)
         hidden = image.new_zeros(len(image), self.width, *frame.size)
         if state is not None and state.shape == hidden.shape:
@@ -34,7 +33,6 @@ class Recurrent(nn.Module):
 
 
 def plain(width: int = 8) -> Model:
-    """Return a model of noisy radiance as it comes."""
     return Recurrent(width)
 
 
@@ -51,34 +49,25 @@ class Guided(nn.Module):
         self.layers = nn.Sequential(nn.Conv2d(10, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, 3, 1))
 
     def forward(self, color: Tensor, albedo: Tensor, normal: Tensor, depth: Tensor) -> Tensor:
-        """Radiance of the same size."""
         near = torch.where(depth.isfinite(), 1 / (1 + depth), 0)
         return torch.relu(color + self.layers(torch.cat([torch.log1p(color), albedo, normal, near], 1)))
 
 
 class Scaled(nn.Module):
-    """One number."""
-
     def __init__(self) -> None:
         super().__init__()
         self.factor = nn.Parameter(torch.ones(()))
 
     def forward(self, color: Tensor) -> Tensor:
-        """Radiance, brighter or darker."""
         return color * self.factor
 
 
 class Cropped(Scaled):
-    """A model whose image does not have the frame's size."""
-
     def forward(self, color: Tensor) -> Tensor:
-        """Radiance of half the image."""
         return super().forward(color)[..., ::2]
 
 
 def broken() -> nn.Module:
-    """Takes what no frame has."""
-
     class Broken(Scaled):
         def forward(self, color: Tensor, curvature: Tensor) -> Tensor:
             return color * curvature * self.factor
@@ -87,13 +76,10 @@ def broken() -> nn.Module:
 
 
 def without_weights() -> Model:
-    """Gives the frame back."""
     return FromBuffers(lambda color: color)
 
 
 def forgetful() -> nn.Module:
-    """Fails at the second frame."""
-
     class Forgetful(Recurrent):
         def forward(self, frame: Frame, state: Tensor | None = None) -> tuple[Output, Tensor]:
             if state is not None:

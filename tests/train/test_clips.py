@@ -12,7 +12,6 @@ PARTS = {**ACCUMULATED, "albedo": 3, "normal": 3, "depth": 1, "reference": 3}
 
 
 def shot_of(stack: Tensor) -> Shot:
-    """A shot that lies in memory, from ``(T, 17, H, W)``."""
     parts = stack.split(list(PARTS.values()), 1)
     return in_memory(dict(zip(PARTS, parts, strict=True)), demodulated=True)
 
@@ -23,7 +22,6 @@ def in_memory(buffers: dict[str, Tensor], *, demodulated: bool = False) -> Shot:
 
 
 def clip_of(stack: Tensor) -> Clip:
-    """A clip from ``(B, T, 17, H, W)``."""
     return Clip(dict(zip(PARTS, stack.split(list(PARTS.values()), 2), strict=True)))
 
 
@@ -34,7 +32,6 @@ def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
 
 
 def orbit(clip: Tensor) -> list[Tensor]:
-    """An image stack in its eight orientations."""
     turned = [clip.rot90(k, (-2, -1)) for k in range(4)]
     return [*turned, *(t.flip(-1) for t in turned)]
 

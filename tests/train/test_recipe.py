@@ -21,7 +21,6 @@ WEIGHTS = "wild_small.safetensors"
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a run of the tiny recipe."""
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
@@ -31,7 +30,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def changed(tmp_path: Path, old: str, new: str) -> Path:
-    """The tiny recipe with something else in it."""
     text = TINY.read_text()
     assert old in text
     path = tmp_path / "changed.toml"

@@ -41,7 +41,6 @@ FIELDS = {field.name for field in dataclasses.fields(TrainConfig)}
 
 @pytest.fixture(scope="module")
 def finished(shared_sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run, which no test changes."""
     run = tmp_path_factory.mktemp("finished") / "deep" / "run"
     train(TrainConfig(**SMALL), [shared_sequence], run, checkpoint_every=2, credits="A. Painter, CC0")
     return run
@@ -66,7 +65,6 @@ class Stopped(Exception):
 
 
 def create_settings(**changed: Any) -> dict[str, Any]:
-    """Every setting that the weights of the model are of."""
     return {"width": 40, "kernel_size": 5, "cascade": "P+K", "bilateral": True, "normalize": "softmax", **changed}
 
 
@@ -92,10 +90,7 @@ def test_one_clip_is_learnt_by_heart(shared_sequence: Path, tmp_path: Path, monk
         return clips[-1]
 
     monkeypatch.setattr(ClipSampler, "draw", draw_once)
-    config = TrainConfig(
-        **{**SMALL, "settings": "width=8", "frames": 3, "batch": 1, "steps": 30},
-        learning_rate=1e-2,
-    )
+    config = TrainConfig(**{**SMALL, "settings": "width=8", "frames": 3, "batch": 1, "steps": 30}, learning_rate=1e-2)
     train(config, [shared_sequence], tmp_path / "run", checkpoint_every=10, report=reports.append)
     assert [progress.step for progress in reports] == [10, 20, 30]
     assert reports[-1].loss < 0.8 * reports[0].loss
@@ -125,7 +120,6 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(shared_sequence: P
     assert all(torch.equal(a, b) for a, b in zip(actual, expected, strict=True))
     digest = describe_weights(resumed)["sha256"]
     assert digest == describe_weights(weights)["sha256"]
-    # A finished run is not run again.
     assert train(config, [shared_sequence], stopped, **go_on) == resumed
     assert (steps, describe_weights(resumed)["sha256"]) == ([3, 6], digest)
 
@@ -179,7 +173,6 @@ def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, 
 
 
 def mcdenoise(*arguments: object, processes: int = 1) -> list[str]:
-    """The command line, as one or several processes of their own."""
     launcher = ["torch.distributed.run", "--standalone", "--nproc-per-node", str(processes), "-m"]
     launch = launcher if processes > 1 else []
     return [sys.executable, "-m", *launch, "mcdenoise", *map(str, arguments)]
@@ -285,14 +278,6 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(shared_sequ
     assert not run.exists()
 
 
-def test_a_damaged_checkpoint_is_refused(again: Callable[..., Path], tmp_path: Path) -> None:
-    checkpoint = tmp_path / "run" / "checkpoint.pt"
-    checkpoint.write_bytes(checkpoint.read_bytes()[:-500])
-    message = refused(again)
-    assert message.startswith(f"{checkpoint}: expected a checkpoint of this run")
-    assert "remove it" in message
-
-
 def test_no_flipped_bit_of_a_checkpoint_is_trained_on(finished: Path, tmp_path: Path) -> None:
     content = (finished / "checkpoint.pt").read_bytes()
     folder, parts = RunFolder(tmp_path), [torch.nn.Linear(1, 1)]
@@ -319,7 +304,6 @@ def test_two_trainings_do_not_share_a_folder(shared_sequence: Path, tmp_path: Pa
         f"{run}: expected a folder that no other training writes to, found process {os.getpid()} of "
         f"{platform.node()} at work in it; wait for it, or choose another folder"
     ]
-    # It is free again.
     (run / f"{MODEL}.safetensors").unlink()
     train(config, [shared_sequence], run, checkpoint_every=1)
 

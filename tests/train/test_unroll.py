@@ -22,7 +22,6 @@ MINE = Path(__file__).parent / "recurrent.py"
 
 
 def clip_of(frames: int = 3, size: tuple[int, int] = (6, 7), dtype: torch.dtype = torch.float32) -> Clip:
-    """Noise that moves by fractions of a pixel."""
     color = 0.2 + torch.rand(2, frames, 3, *size, dtype=dtype)
     motion = 1.3 * torch.rand(2, frames, 2, *size, dtype=dtype) - 0.4
     return Clip({"color": color, "motion": motion, "reference": torch.rand_like(color)})
@@ -62,7 +61,6 @@ def test_the_gradient_through_time() -> None:
 
 
 def trained(model: str, sequence: Path, out: Path, **changes: Any) -> tuple[Path, list[float]]:
-    """The weights of a short run, and its losses."""
     pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
     pytest.importorskip("tensorboard", reason="training needs the packages of mcdenoise[train]")
     from mcdenoise.train import TrainConfig, train
