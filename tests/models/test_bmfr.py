@@ -65,18 +65,6 @@ def test_images_of_a_batch_may_be_at_different_frames() -> None:
     torch.testing.assert_close(model(both, state)[0].image[:1], model(given, one)[0].image)
 
 
-def test_light_that_is_a_function_of_the_features_is_reproduced() -> None:
-    """A constant; and light that is linear in them, and in squares of positions, through all of it."""
-    given = frame()
-    whole = (2 + given.position[:, :1] - 0.3 * given.position[:, 1:2].square() + 0.5 * given.normal[:, :1]).repeat(
-        1, 3, 1, 1
-    )
-    for light in (torch.full_like(whole, 0.7), whole):
-        denoiser = Denoiser("bmfr")
-        for _ in range(4):
-            torch.testing.assert_close(denoiser(given.replace(color=light)), light, rtol=1e-4, atol=0)
-
-
 def naive(new: list[list[list[float]]], before: list[list[list[float]]], alpha: float) -> Tensor:
     """``taa`` of the public code, for a scene at rest, of gamma-mapped values ``[row][column][channel]``."""
 

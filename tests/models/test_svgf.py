@@ -73,21 +73,6 @@ def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None
         torch.testing.assert_close(image, noise.color, rtol=1e-3, atol=1e-3)
 
 
-def test_no_edge_of_normals_or_depths_is_crossed() -> None:
-    noise = frame().color
-    right = (torch.arange(WIDTH) >= WIDTH // 2).expand_as(noise[:, :1])
-    lit = torch.where(right, noise, 0)
-    image = Svgf()(frame(lit))[0].image
-    assert not image[..., : WIDTH // 2].any()
-    flat = torch.zeros_like(noise)
-    flat[:, 2] = 1
-    apart = frame(lit, normal=flat, depth=torch.where(right, 3.0, 6.0))
-    # The remaining weight is exp(-1000): a step of the depth itself, beside a thousandth of it.
-    assert not Svgf()(apart)[0].image[..., : WIDTH // 2].any()
-    together = frame(lit, normal=flat)
-    assert Svgf()(together)[0].image[..., : WIDTH // 2].any()
-
-
 def test_motion_comes_from_positions_and_cameras_too() -> None:
     """A camera that shifts the image by two pixels, seen once in motion and once in positions."""
     ys, xs = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")

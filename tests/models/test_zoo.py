@@ -61,10 +61,6 @@ def test_the_number_of_weights(name: str, settings: dict[str, Any], expected: in
     assert sum(each.numel() for each in model.parameters()) == expected
 
 
-# Methods that keep something of the frame before, one of each kind.
-WITH_HISTORY = ["accumulated", "anf", "asvgf", "bmfr", "nppd", "rae", "svgf", "wild_small"]
-
-
 @pytest.mark.parametrize("name", ["accumulated", "anf", "nppd", "rae", "wild_small"])
 @torch.no_grad()
 def test_a_state_of_zeros_is_that_of_no_frame(name: str) -> None:
@@ -72,22 +68,6 @@ def test_a_state_of_zeros_is_that_of_no_frame(name: str) -> None:
     first, second = (whole_frame(model, 17, 20, seed=seed) for seed in range(2))
     zeros = pytree.tree_map_only(Tensor, torch.zeros_like, model(first)[1])
     torch.testing.assert_close(model(second, zeros)[0].image, model(second)[0].image)
-
-
-@pytest.mark.parametrize("name", WITH_HISTORY)
-def test_another_size_and_frames_without_motion_begin_anew(name: str) -> None:
-    denoiser = Denoiser(small(name))
-    frames = [whole_frame(denoiser.model, *size, seed=seed) for seed, size in enumerate([(12, 15)] * 2 + [(9, 8)] * 2)]
-    lost = dict.fromkeys(("motion", "previous_position", "view_projection"))
-    for number, frame in enumerate((*frames[:3], frames[3].replace(**lost))):
-        image = denoiser(frame)
-        # What has no motion cannot see a cut, and what has no positions compares none.
-        if number == 1:
-            assert denoiser.report.reset == ""
-        elif number < 3:
-            assert denoiser.report.reset == ("first frame" if number == 0 else "size change")
-        if number == 2:
-            torch.testing.assert_close(image, Denoiser(denoiser.model)(frame))
 
 
 @pytest.mark.parametrize("name", ["asvgf", "bmfr", "guided", "joint_bilateral", "svgf"])
