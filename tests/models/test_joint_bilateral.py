@@ -60,3 +60,14 @@ def test_guides_itself_without_features() -> None:
     guide = guide.unfold(2, 3, 1).unfold(3, 3, 1).flatten(4).median(4).values
     expected = joint_bilateral_blur(color, guide, 9, 0.2, (2.0, 2.0), **settings)
     torch.testing.assert_close(JointBilateral(0.2, 2.0)(Frame(color=color))[0].image, expected)
+
+
+def test_differentiable() -> None:
+    given = frame(3, 4).to(torch.float64)
+    model = JointBilateral(0.5, 0.5)
+
+    def image(color: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:
+        return model(given.replace(color=color, albedo=albedo))[0].image
+
+    leaves = given.color.requires_grad_(), given.albedo.clone().requires_grad_()
+    assert torch.autograd.gradcheck(image, leaves)

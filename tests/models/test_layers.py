@@ -93,6 +93,22 @@ def test_layers_sum_to_the_image_in_float64_and_have_derivatives(name: str) -> N
         assert bool(gradient.any()) is not (name in HISTORY_OF_IMAGES and frame is second)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
+@torch.no_grad()
+def test_layers_of_tiles_are_those_of_the_image(name: str) -> None:
+    whole = Denoiser(small(name))
+    if not isinstance(whole.model, nn.Module) or not any(isinstance(part, Tiled) for part in whole.model.modules()):
+        pytest.skip("it is not divided")
+    tiled = Denoiser(small(name), tile=64)
+    for frame in shot(whole.model, 2, (70, 150)):
+        expected, found = whole.output(frame), tiled.output(frame)
+        assert_sum(found.image, found.layers)
+        for key, layer in expected.layers.items():
+            # Convolutions of another size sum in another order; logarithms and kernels pass that on.
+            torch.testing.assert_close(found.layers[key], layer, rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
 def test_a_layer_that_is_all_is_the_image_and_one_that_is_black_stays_black(name: str) -> None:
