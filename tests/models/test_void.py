@@ -29,7 +29,7 @@ def blur(color: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("how", ["mask", "alpha", "depth", "features"])
-@pytest.mark.parametrize("model", ["joint_bilateral", "guided", blur], ids=str)
+@pytest.mark.parametrize("model", ["joint_bilateral", "guided", blur])
 def test_charts_keep_their_light_up_to_their_borders_and_give_each_other_none(model: object, how: str) -> None:
     """A window is wider than the gutter, and no feature tells one chart from the other."""
     color, valid = charts()
