@@ -26,7 +26,7 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
-from mcdenoise.ops import demodulate, remodulate
+from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._steps.transfer import compress
 from mcdenoise.ops._steps.wild import wild_choice, wild_input
 from mcdenoise.ops._window import corner, up_to_multiple
@@ -103,9 +103,9 @@ class WildNetwork(nn.Module):
     They are the image that the network predicts, the frame, the accumulated radiance, and the mean of the last two, see
     :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where
     ``h`` is the part of the history in the accumulated radiance, ``1 - 1 / length``. So without a history only the
-    network's image and the radiance have a weight. Radiance is taken and returned without its albedo, as
-    :class:`mcdenoise.models.Demodulated` divides it out; the network works on the products. A missing albedo counts as
-    one, a missing normal as zero.
+    network's image and the radiance have a weight; a background has none. Radiance is taken and returned without its
+    albedo, as :class:`mcdenoise.models.Demodulated` divides it out; the network works on the products. A missing albedo
+    counts as one, a missing normal as zero.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
@@ -122,7 +122,7 @@ class WildNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.weight[3:].div_(_PACE)
             last.bias.zero_()[3].fill_(_LITTLE / _PACE)
-        uses, unet = frozenset({"current", "length", "albedo", "normal"}), self.unet
+        uses, unet = frozenset({"current", "length", "albedo", "normal", "depth"}), self.unet
         self.needs = Needs(uses=uses, reach=unet.reach + Trust.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -138,6 +138,8 @@ class WildNetwork(nn.Module):
         mean, part = history, torch.zeros_like(color[:, :1])
         if frame.length is not None:
             part = (1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
+            if (behind := _background(frame)) is not None:
+                part, history = torch.where(behind, 0, part), torch.where(behind, alone, history)
             shown = (compress(image * exposure) for image in (alone, history))
             mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
         seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
@@ -149,6 +151,14 @@ class WildNetwork(nn.Module):
 
 def _lit(frame: Frame, image: Tensor) -> Tensor:
     return image if frame.albedo is None else remodulate(image, frame.albedo)
+
+
+def _background(frame: Frame) -> Tensor | None:
+    """Where nothing is seen, not even fog, which has an albedo: what is there has no noise, and a history blurs it."""
+    if frame.depth is None:
+        return None
+    nothing = frame.depth == torch.inf
+    return nothing if frame.albedo is None else nothing & (frame.albedo.amax(1, keepdim=True) < NO_ALBEDO)
 
 
 def _wild(

@@ -77,6 +77,18 @@ def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
     assert not torch.allclose(weight(flat + noise), weight(flat + 0.1))
 
 
+@pytest.mark.parametrize(("albedo", "alike"), [(0.0, True), (0.3, False)], ids=["sky", "fog"])
+def test_a_sky_is_taken_from_the_frame_alone(albedo: float, alike: bool) -> None:
+    frame = given(9)
+    frame = frame.replace(depth=torch.full_like(frame.length, torch.inf), albedo=torch.full_like(frame.color, albedo))
+    model = network(0.31, (-0.2, 0.4, 0.5, 0.1))
+    exposed = model.statistics(frame)
+    first, second = (
+        model(frame.replace(color=color, statistics=exposed))[0].image for color in (frame.color, 2 * frame.color)
+    )
+    assert torch.equal(first, second) == alike
+
+
 @has_oidn
 def test_it_starts_as_the_library() -> None:
     model: Any = create_model("wild")
