@@ -278,6 +278,14 @@ def test_a_folder_whose_name_is_not_utf_8_is_refused_before_the_work(shared_sequ
     assert not run.exists()
 
 
+def test_a_damaged_checkpoint_is_refused(again: Callable[..., Path], tmp_path: Path) -> None:
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-500])
+    message = refused(again)
+    assert message.startswith(f"{checkpoint}: expected a checkpoint of this run")
+    assert "remove it" in message
+
+
 def test_no_flipped_bit_of_a_checkpoint_is_trained_on(finished: Path, tmp_path: Path) -> None:
     content = (finished / "checkpoint.pt").read_bytes()
     folder, parts = RunFolder(tmp_path), [torch.nn.Linear(1, 1)]

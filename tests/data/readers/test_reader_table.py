@@ -96,6 +96,21 @@ def test_files_with_names_of_other_renderers_are_read_without_a_flag(
         assert said["motion"].startswith(SIGNS.get(renderer, "previous - current, y down, pixels"))
 
 
+@pytest.mark.parametrize("renderer", ["pbrt", "redshift", "falcor"])
+def test_cameras_found_from_positions_lead_where_motion_does(renderer: str, others: Any, tmp_path: Path) -> None:
+    others.write(renderer, tmp_path)
+    sequence = open_sequence(tmp_path)
+    frames = [sequence.frame(number) for number in sequence.numbers]
+    for number, before, now in zip(sequence.numbers[1:], frames[:-1], frames[1:], strict=True):
+        truth = others.read(number)
+        # The floor stands still; the object above it does not.
+        still = truth["hit"] & (np.abs(truth["position"][..., 2]) < 1e-5)
+        position = pixels(now.position)
+        here, there = projected(position, now.view_projection), projected(position, before.view_projection)
+        np.testing.assert_allclose(here[truth["hit"]], center(position)[truth["hit"]], atol=1e-3)
+        np.testing.assert_allclose((there - here)[still], truth["motion"][still], atol=2e-3)
+
+
 def layer(path: Path, name: str, components: str) -> Image:
     channels = channels_of(path)
     return np.stack([channels[f"{name}.{each}" if name else each] for each in components], -1).astype(np.float32)
