@@ -79,8 +79,9 @@ class Trust(nn.Module):
             albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
             normal: likewise; ``None`` counts as zero.
         """
-        albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0, 1)
-        normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1, 1)
+        # In ONNX, bounds that are integers become tensors, which onnxscript loses if two steps clamp the same image.
+        albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0.0, 1.0)
+        normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1.0, 1.0)
         own, both, surface = (image.mean(1, keepdim=True) for image in (alone, color, albedo))
         apart, lengths = (own - both).abs(), normal.square().sum(1, keepdim=True)
         each = torch.cat(

@@ -60,6 +60,6 @@ def seen_by_oidn(color: Tensor, albedo: Tensor | None = None, normal: Tensor | N
         ``(B, 9, H, W)``, in [0, 1]; without a feature 3 channels fewer.
     """
     images = [color]
-    images += [] if albedo is None else [albedo.clamp(0, 1)]
-    images += [] if normal is None else [normal.clamp(-1, 1) * 0.5 + 0.5]
+    images += [] if albedo is None else [albedo.clamp(0.0, 1.0)]
+    images += [] if normal is None else [normal.clamp(-1.0, 1.0) * 0.5 + 0.5]
     return torch.cat(images, 1)
