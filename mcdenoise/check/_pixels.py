@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 from mcdenoise import ops
 from mcdenoise.check.case import Draw, Op, between, constant, dim, normal, numbers, powers, radiance, times, uniform
 from mcdenoise.check.regimes import IMAGE, IMAGES, SMALL, Argument, Size, checked, extreme, half, ordinary, stiff
-from mcdenoise.ops._grid import cells_of
+from mcdenoise.ops._window import parts_of
 
 _HALF = replace(IMAGE, axes=half)
 _POSITIVE = {name: draw for name, draw in IMAGES.items() if "signs" not in name}
@@ -99,7 +99,7 @@ def _two(g: Generator, *shape: int) -> Tensor:
 
 
 def _cells(size: Size, settings: Mapping[str, Any]) -> tuple[int, ...]:
-    return cells_of(size[2], settings["cell"]), cells_of(size[3], settings["cell"]), 4
+    return parts_of(size[2], settings["cell"]), parts_of(size[3], settings["cell"]), 4
 
 
 def _guide_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[str, Tensor]:

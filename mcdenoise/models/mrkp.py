@@ -29,7 +29,7 @@ from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.ops import downsample, kernel_conv
-from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
+from mcdenoise.ops._window import accumulator_dtype, corner, parts_of, up_to_multiple
 
 LEVELS, SCALES = 5, 3
 # Added to the sum of a kernel's weights.
@@ -83,7 +83,7 @@ class Backbone(nn.Module):
             x = torch.cat([F.relu(deconvolution(x)), skip], 1)
             found.append(x)
         finest = enumerate(found[: -SCALES - 1 : -1])
-        return [corner(each, -(-height // (1 << scale)), -(-width // (1 << scale))) for scale, each in finest]
+        return [corner(each, parts_of(height, 1 << scale), parts_of(width, 1 << scale)) for scale, each in finest]
 
 
 def with_glorot(layer: nn.Module) -> nn.Module:

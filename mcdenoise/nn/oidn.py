@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from mcdenoise.nn._cpu import ConvBlock, UpConvBlock, convolved_in_float32
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
-from mcdenoise.ops._window import computing_dtype, corner, up_to_multiple
+from mcdenoise.ops._window import computing_dtype, corner, parts_of, up_to_multiple
 
 Size: TypeAlias = Literal["small", "base", "large"]
 
@@ -160,7 +160,7 @@ def oidn_exposure(color: Tensor) -> Tensor:
 def _binned(image: Tensor, axis: int) -> Tensor:
     """Means over equal parts of an axis, as sums: autocast would round a matrix product to half precision."""
     side = image.shape[axis]
-    count = -(-side // _BIN)
+    count = parts_of(side, _BIN)
     edges = torch.arange(count + 1, device=image.device) * side // count
     # The part between whose edges a pixel lies: i >= floor(b side / count) if and only if b < (i + 1) count / side.
     part = (torch.arange(1, side + 1, device=image.device) * count - 1) // side

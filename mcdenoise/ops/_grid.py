@@ -6,11 +6,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._constants import TENT_ROUNDING
-
-
-def cells_of(side: int, cell: int) -> int:
-    """How many cells of so many pixels a side of the image takes."""
-    return -(-side // cell)
+from mcdenoise.ops._window import parts_of
 
 
 def tent(distance: Tensor) -> Tensor:
@@ -28,4 +24,4 @@ def spatial_taps(side: int, cell: int, like: Tensor) -> tuple[Tensor, Tensor]:
     first = torch.div(centre - cell, 2 * cell, rounding_mode="floor")
     cells = torch.stack([first, first + 1])
     distance = (centre - cell * (2 * cells + 1)).to(like.dtype) / (2 * cell)
-    return cells, tent(distance) * ((cells >= 0) & (cells < cells_of(side, cell)))
+    return cells, tent(distance) * ((cells >= 0) & (cells < parts_of(side, cell)))

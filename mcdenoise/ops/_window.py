@@ -80,6 +80,11 @@ def shifted(padded: Tensor, radius: int, dy: int, dx: int, height: int, width: i
     return padded.narrow(-2, radius + dy, height).narrow(-1, radius + dx, width)
 
 
+def parts_of(size: int, part: int) -> int:
+    """How many parts cover a size; exported graphs round the quotient of a negative number up, unlike Python."""
+    return (size + part - 1) // part
+
+
 def up_to_multiple(image: Tensor, side: int, mode: Literal["constant", "replicate"] = "constant") -> Tensor:
     """``(..., H, W)`` with zeros after it, or its edge repeated, up to whole multiples of ``side``."""
     right, below = ((size + side - 1) // side * side - size for size in (image.shape[-1], image.shape[-2]))

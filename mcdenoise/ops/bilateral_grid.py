@@ -7,10 +7,10 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_least
 from mcdenoise.ops._constants import GUIDE_STEPS
-from mcdenoise.ops._grid import cells_of, spatial_taps, tent
+from mcdenoise.ops._grid import spatial_taps, tent
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import op
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, parts_of
 
 CELL, BINS = 8, 32
 
@@ -26,7 +26,7 @@ def _check_cell(cell: int) -> None:
 def _check_slice(grid: Tensor, guide: Tensor, cell: int) -> None:
     found, size = tuple(grid.shape[2:4]), tuple(guide.shape[2:])
     check_least(1, cell=cell, bins=grid.shape[4])
-    expected = tuple(cells_of(side, cell) for side in size)
+    expected = tuple(parts_of(side, cell) for side in size)
     if found != expected:
         raise ValueError(
             f"grid: expected {expected} rows and columns for a guide of {size} in cells of {cell}, found {found}"
@@ -77,7 +77,7 @@ def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BI
         ([1.0, 5.0], [1.0, 1.0])
     """
     dtype = accumulator_dtype(image.dtype)
-    rows, columns = (cells_of(side, cell) for side in image.shape[-2:])
+    rows, columns = (parts_of(side, cell) for side in image.shape[-2:])
     index, weight = _taps(guide.to(dtype), cell, rows, columns, bins)
     values = torch.cat([image.to(dtype), torch.ones_like(guide, dtype=dtype)], 1)
     source = (values[:, :, None] * weight[:, None]).flatten(2)

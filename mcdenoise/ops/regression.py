@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_least, check_shapes
 from mcdenoise.ops._module import module_of
-from mcdenoise.ops._window import mirrored_places
+from mcdenoise.ops._window import mirrored_places, parts_of
 
 BLOCK = 32
 # The fit changes the part of the image that the features explain by this fraction: less than float32 rounds.
@@ -86,7 +86,7 @@ def block_regression(
         return image
     rows, columns = (
         # As many whole blocks as cover the axis.
-        mirrored_places(torch.arange(-start, -(-(size + start) // block) * block - start, device=image.device), size)
+        mirrored_places(torch.arange(-start, parts_of(size + start, block) * block - start, device=image.device), size)
         for size, start in zip((sizes["H"], sizes["W"]), offset, strict=True)
     )
     both = torch.cat([features.to(torch.float64), image.to(torch.float64)], 1)

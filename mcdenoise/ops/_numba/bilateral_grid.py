@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._constants import GUIDE_STEPS, TENT_ROUNDING
-from mcdenoise.ops._grid import cells_of, spatial_taps
+from mcdenoise.ops._grid import spatial_taps
 from mcdenoise.ops._numba._runtime import Source, compiled, load, read_row, readable, share_rows, source
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, parts_of
 
 _SIDE_BY_SIDE = 4
 
@@ -41,7 +41,7 @@ def grid_splat(image: Tensor, guide: Tensor, cell: int, bins: int) -> tuple[Tens
     """See :func:`mcdenoise.ops.grid_splat`."""
     dtype = accumulator_dtype(image.dtype)
     batch, channels, height, width = image.shape
-    cells = cells_of(height, cell), cells_of(width, cell), bins
+    cells = parts_of(height, cell), parts_of(width, cell), bins
     means = torch.zeros((batch, channels, *cells), dtype=dtype, device="cpu")
     filled = torch.zeros((batch, 1, *cells), dtype=dtype, device="cpu")
     if filled.numel():
