@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import warnings
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,8 @@ from mcdenoise.export import Exported, Step, default_buffers, export_model, trac
 from mcdenoise.models import Demodulated, Model, Needs, Output, State
 from mcdenoise.models import Recurrent as Recurrence
 from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models.wild import WildNetwork
+from mcdenoise.nn.oidn import oidn_exposure
 
 # Sums in another order, through some thirty layers: this is the suite's bound for whole models, see tests/golden.
 RTOL, ATOL = 1e-4, 1e-5
@@ -205,6 +208,29 @@ def test_a_graph_is_run_as_the_page_for_engines_does(graph: Path) -> None:
     assert {each.type.tensor_type.elem_type for each in (*model.graph.input, *model.graph.output)} == {
         onnx.TensorProto.FLOAT
     }
+
+
+class InUnits(nn.Module):
+    """Radiance on Open Image Denoise's scale."""
+
+    needs = Needs()
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        return Output(frame.color * oidn_exposure(frame.color)), None
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning", "ignore::UserWarning")
+@pytest.mark.parametrize("make", [InUnits, lambda: WildNetwork("small").eval()], ids=["exposure", "wild"])
+def test_a_graph_counts_and_clamps_as_python_does(make: Callable[[], Model], tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript", reason="graphs in ONNX need the extra mcdenoise[export]")
+    torch.manual_seed(0)
+    model = make()
+    exported, step = export_model(model, tmp_path / "model.onnx"), Step(model, default_buffers(model))
+    # A height of which a sixteenth is no whole number.
+    (buffers, other, *_) = frames((33, 47))
+    length = torch.full_like(buffers["color"][:, :1], 4.0)
+    shot = [buffers | {"current": other["color"], "length": length}]
+    assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
 
 
 @pytest.mark.slow
