@@ -56,7 +56,7 @@ from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.ops import kernel_splat, learned_upsample, pyramid_partition
-from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops._window import corner, parts_of, up_to_multiple
 
 Backbone = Literal["convunet", "convunext"]
 
@@ -243,7 +243,7 @@ class Nppd(nn.Module):
         for level, weights in enumerate(predicted):
             side = 1 << level
             names = _COARSE if level else _FINE
-            cut = corner(weights, (height + side - 1) // side, (width + side - 1) // side).to(seen.dtype)
+            cut = corner(weights, parts_of(height, side), parts_of(width, side)).to(seen.dtype)
             found.append(dict(zip(names, cut.split(list(names.values()), 1), strict=True)))
         return found[0], found[1:]
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import corner, parts_of
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
@@ -92,7 +92,7 @@ class UNet(nn.Module):
         found = []
         for scale in range(self.scales):
             side = 1 << scale
-            found.append(corner(features[scale], (height + side - 1) // side, (width + side - 1) // side))
+            found.append(corner(features[scale], parts_of(height, side), parts_of(width, side)))
         return found
 
     def _features(self, x: Tensor) -> list[Tensor]:
@@ -112,7 +112,7 @@ class UNet(nn.Module):
 
 def _padded(x: Tensor, multiple: int) -> Tensor:
     """Repeat the last row and column of ``x`` up to multiples of ``multiple``."""
-    below, right = ((side + multiple - 1) // multiple * multiple - side for side in x.shape[-2:])
+    below, right = (parts_of(side, multiple) * multiple - side for side in x.shape[-2:])
     # A graph for any image size cannot branch on whether padding is needed.
     if torch.compiler.is_compiling():
         return F.pad(x, (0, right, 0, below), mode="replicate")

@@ -87,7 +87,7 @@ def parts_of(size: int, part: int) -> int:
 
 def up_to_multiple(image: Tensor, side: int, mode: Literal["constant", "replicate"] = "constant") -> Tensor:
     """``(..., H, W)`` with zeros after it, or its edge repeated, up to whole multiples of ``side``."""
-    right, below = ((size + side - 1) // side * side - size for size in (image.shape[-1], image.shape[-2]))
+    right, below = (parts_of(size, side) * side - size for size in (image.shape[-1], image.shape[-2]))
     return F.pad(image, (0, right, 0, below), mode=mode)
 
 
