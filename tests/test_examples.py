@@ -347,7 +347,8 @@ def packed(tmp_path: Path) -> Path:
         wall = {"albedo": np.full((frames, 3, *size), 0.5), "normal": np.ones((frames, 3, *size))}
         wall |= {"depth": np.ones((frames, 1, *size)), "motion": np.zeros((frames, 2, *size))}
         light = {"color": image(frames, 3, *size), "reference": np.full((references, 3, *size), 0.5)}
-        write_shard(tmp_path / "takes" / f"{number}.take.npz", {"credits": ["sky (Ann, CC0)"]}, wall | light)
+        header = {"credits": ["sky (Ann, CC0)"], "spp": 1 + 3 * number}
+        write_shard(tmp_path / "takes" / f"{number}.take.npz", header, wall | light)
     run("gpu/pack.py", tmp_path / "takes", "-o", tmp_path / "packed")
     return tmp_path / "packed"
 
@@ -355,6 +356,8 @@ def packed(tmp_path: Path) -> Path:
 def test_packed_takes_are_tiles_with_two_histories(packed: Path) -> None:
     tiles = runpy.run_path(str(EXAMPLES / "gpu" / "train.py"))["Tiles"](packed, torch.device("cpu"))
     assert [(take["frames"], take["histories"]) for take in tiles.takes] == [(2, 2), (1, 1), (1, 1)]
+    # Both noise levels, one sample and four, have two frames to draw.
+    torch.testing.assert_close(tiles.weights, torch.tensor([2.0, 1.0, 1.0]) / 2**0.5)
     long, short = tiles.history[:2], tiles.history[2:4]
     assert long[:, 3].max() == 13
     assert short[:, 3].max() < 13

@@ -64,7 +64,8 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
     for shard in shards:
         handed = front.of(shard.shapes), FEATURES, shard.references, path.parent
         shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)[0]]
-        about = {"take": shard.path.name.partition(".")[0], "frames": shard.references, "histories": len(shots)}
+        name, spp = shard.path.name.partition(".")[0], shard.header["spp"]
+        about = {"take": name, "frames": shard.references, "histories": len(shots), "spp": spp}
         for place in tiles(shard.size):
             index.append(about)
             fixed.append(part_of(shots[0], FIXED, place))

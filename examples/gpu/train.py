@@ -5,7 +5,8 @@
     python examples/gpu/train.py packed -o OUT --recipe recipes/wild.toml --run base --validation packed-unseen
 
 Parts may be added to the folder while it runs. Single frames with their history are drawn and augmented on the device,
-many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one; the learning rate follows the clock. The
+many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one, but each noise level (samples a pixel) as
+often as the square root of its number of frames: most takes have one sample. The learning rate follows the clock. The
 loss of a frame is the logarithm of its error, so that one with little noise counts as much as one with much: what is
 reported of a method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are
 written again at each validation. The same command goes on where an interrupted run was.
@@ -93,8 +94,11 @@ class Tiles:
                 first, begun = first + take["frames"], begun + take["frames"] * take["histories"]
             self.fixed, self.history = torch.cat([self.fixed, fixed]), torch.cat([self.history, history])
             self.parts[path.name] = about
-        rows = [[take[name] for name in ("first", "begun", "frames", "histories")] for take in self.takes]
+        rows = [[take[name] for name in ("first", "begun", "frames", "histories", "spp")] for take in self.takes]
         self.table = torch.tensor(rows, device=self.device)
+        frames, levels = self.table[:, 2].float(), self.table[:, 4].unique(return_inverse=True)[1]
+        of_level = torch.zeros(len(frames), device=self.device).index_add_(0, levels, frames)[levels]
+        self.weights = frames / of_level.sqrt()
 
     def _joined(self, part: Any, name: str) -> Tensor:
         low, high = (torch.from_numpy(part[f"{name}.{byte}"]).to(self.device) for byte in (0, 1))
@@ -109,9 +113,8 @@ class Tiles:
     def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor]:
         """Draw single frames as a batch, and their references."""
         rand = torch.rand(8, clips, device=self.device)
-        # As often as it has frames.
-        drawn = torch.multinomial(self.table[:, 2].float(), clips, replacement=True)
-        first, begun, frames, histories = self.table[drawn].unbind(1)
+        drawn = torch.multinomial(self.weights, clips, replacement=True)
+        first, begun, frames, histories, _ = self.table[drawn].unbind(1)
         t = (rand[0] * frames).long()
         when, which = first + t, begun + (rand[1] * histories).long() * frames + t
         sides = torch.arange(config.crop, device=self.device)
@@ -172,10 +175,10 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
 
 
 def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Where lamps are, their radiance and albedo."""
+    """Where lamps are, their radiance and albedo; as many are small, down to single pixels, as are large."""
     clips, side = len(reference), torch.arange(config.crop, device=reference.device)
     own = torch.rand(7, clips, device=reference.device)
-    sizes = 2 + own[:2] * (config.crop // 3)
+    sizes = (config.crop / 3) ** own[:2]
     starts = own[2:4] * (config.crop - sizes)
     rows, columns = ((side >= s[:, None]) & (side < (s + n)[:, None]) for s, n in zip(starts, sizes, strict=True))
     inside = (rows[:, :, None] & columns[:, None, :] & (rand[2] < config.lamps)[:, None, None])[:, None]
