@@ -45,7 +45,7 @@ from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
 from mcdenoise.train.run_folder import about_weights
 
-LOOKS, LOOK = 40, 20.0  # validations, and looks for new parts; but at least that many seconds apart
+LOOKS, LOOK = 20, 20.0  # validations, and looks for new parts; but at least that many seconds apart
 WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
