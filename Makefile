@@ -3,9 +3,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-COMPARED := "oidn(quality=fast,auxiliary=noisy)" "oidn(quality=balanced,auxiliary=noisy)" \
-  "oidn(auxiliary=prefiltered)" oidn_temporal wild_small wild wild_large
-
 .DEFAULT_GOAL := help
 .PHONY: help demo test docs figures blender lint format clean
 
@@ -28,8 +25,8 @@ figures: $(VENV)/.stamp-fast,render,peers,report ## measure anew what the docume
 	$(BIN)/mcdenoise generate --takes --unseen --seeds 900080-900095 -o build/figures/takes
 	$(BIN)/mcdenoise generate --takes --unseen --plain --frames 32 --seeds 900116-900123 -o build/figures/long
 	for takes in takes long; do $(BIN)/python examples/takes.py build/figures/$$takes --clean build/figures/clean-$$takes \
-		--models $(COMPARED) --json benchmarks/$$takes.json || exit; done
-	$(BIN)/python examples/run_time.py --threads 2 --rounds 5 --models $(COMPARED) --json benchmarks/run-time.json
+		--json benchmarks/$$takes.json || exit; done
+	$(BIN)/python examples/run_time.py --threads 2 --rounds 5 --json benchmarks/run-time.json
 	$(BIN)/python examples/write_tables.py benchmarks
 
 blender: $(VENV)/.stamp-export ## build the extension for Blender: build/mcdenoise-blender.zip

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from takes import METHODS
 
 from mcdenoise import Frame, create_model
 from mcdenoise.benchmark.machine import describe_machine
@@ -31,12 +32,6 @@ from mcdenoise.models._precision import PRECISIONS, Precision, computing_in
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.turns import interleaved
-
-OIDN = (
-    "oidn(quality=fast, auxiliary=noisy)",
-    "oidn(quality=balanced, auxiliary=noisy)",
-    "oidn(quality=high, auxiliary=clean)",
-)
 
 
 def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], object]]:
@@ -64,7 +59,7 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--models", nargs="+", default=[*OIDN, *pretrained_models()], metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=[*METHODS], metavar="MODEL")
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)

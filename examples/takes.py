@@ -25,7 +25,7 @@ from mcdenoise.errors import run_script
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
-from mcdenoise.models import DEFAULT, Model
+from mcdenoise.models import Model
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
 from mcdenoise.train.footage import frame_of
@@ -33,6 +33,16 @@ from mcdenoise.train.footage import frame_of
 # Errors by take, method and metric.
 Rows: TypeAlias = dict[str, dict[str, dict[str, float]]]
 OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=prefiltered)")
+# Those that the documentation compares, with their labels there.
+METHODS = {
+    "oidn(quality=fast,auxiliary=noisy)": "OIDN fast",
+    "oidn(quality=balanced,auxiliary=noisy)": "OIDN balanced",
+    "oidn(auxiliary=prefiltered)": "OIDN high, features denoised first",
+    "oidn_temporal": "`oidn_temporal`",
+    "wild_small": "`wild_small`",
+    "wild": "`wild`",
+    "wild_large": "`wild_large`",
+}
 
 
 @torch.no_grad()
@@ -88,13 +98,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
     parser.add_argument("--clean", type=Path, metavar="FOLDER", help="for copies with clean references")
-    parser.add_argument("--models", nargs="+", default=["oidn_temporal", DEFAULT], metavar="NAME")
+    parser.add_argument("--models", nargs="+", default=[*METHODS], metavar="NAME")
     parser.add_argument("--json", type=Path, metavar="FILE", help="all errors; takes in it are not measured again")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
 
     torch.set_num_threads(options.threads)
-    models = [*OIDN, *options.models]
+    models = list(dict.fromkeys([*OIDN, *options.models]))
     denoisers = {name: parse_method(name).denoiser(precision="float32").model for name in models}
     rows = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
     for path in (path for folder in options.takes for path in find_shards(folder)):

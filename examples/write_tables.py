@@ -17,21 +17,12 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from takes import OIDN, Rows, mean, ratios
+from takes import METHODS, OIDN, Rows, mean, ratios
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.reading import read_text
 
-METHODS = {
-    "oidn(quality=fast,auxiliary=noisy)": "OIDN fast",
-    "oidn(quality=balanced,auxiliary=noisy)": "OIDN balanced",
-    "oidn(auxiliary=prefiltered)": "OIDN high, features denoised first",
-    "oidn_temporal": "`oidn_temporal`",
-    "wild_small": "`wild_small`",
-    "wild": "`wild`",
-    "wild_large": "`wild_large`",
-}
 PAGES = ("README.md", "docs/results.md", "docs/performance.md")
 PLOT = Path("docs/error_and_time.svg")
 _TICKS, _MIDDLE = (100, 300, 1000, 3000, 10000), 1000
