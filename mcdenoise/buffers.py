@@ -68,12 +68,13 @@ BUFFERS: dict[str, BufferSpec] = {
     "mask": BufferSpec(1, 0.0, 1.0, "validity: 0 where a pixel is void, such as a texel outside of all charts"),
     "reference": BufferSpec(3, 0.0, LARGEST_RADIANCE, "converged radiance, scene-linear RGB"),
     "current": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance of this frame alone, where color is accumulated"),
+    "recent": BufferSpec(3, 0.0, LARGEST_RADIANCE, "radiance of the last few frames, where color is accumulated"),
     "length": BufferSpec(1, 0.0, _UNBOUNDED, "history length of an accumulated color, in frames"),
 }
 
 
 # Buffers of radiance, which scale with the light of a scene; the first three channels of samples also do.
-RADIANCE = ("color", "current", "diffuse", "specular", "emission")
+RADIANCE = ("color", "current", "recent", "diffuse", "specular", "emission")
 
 # Buffers that only tell where a pixel was in the previous frame: they are not needed without a history.
 MOTION = frozenset({"position", "motion", "previous_position"})

@@ -101,6 +101,8 @@ class Frame:
         reference: ``(B, 3, H, W)`` converged radiance of the same pixels.
         current: ``(B, 3, H, W)`` radiance of the current frame, if ``color`` is accumulated: added by the wrapper
             :class:`mcdenoise.models.Accumulated`.
+        recent: ``(B, 3, H, W)`` radiance of a shorter history, of about the last four frames; added by the same wrapper
+            where it tests for lag.
         length: ``(B, 1, H, W)`` history length of ``color`` in frames, at least 1; added by the same wrapper.
         extra: further ``(B, C, H, W)`` buffers by name.
         layers: ``(B, 3, H, W)`` radiance by name, such as diffuse and glossy light, which adds up to ``color``: parts
@@ -142,6 +144,7 @@ class Frame:
     samples: Tensor | None = None
     reference: Tensor | None = None
     current: Tensor | None = None
+    recent: Tensor | None = None
     length: Tensor | None = None
     extra: Mapping[str, Tensor] = field(default_factory=dict)
     layers: Mapping[str, Tensor] = field(default_factory=dict)
@@ -349,7 +352,7 @@ class Frame:
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
 _NAMES = tuple(each.name for each in fields(Frame) if each.name not in (*_OF_HOSTS, "hints"))
 # Buffers that a renderer provides in addition to the color; the others are added by wrappers.
-OF_RENDERERS = frozenset(_NAMES) - {"color", "current", "length"}
+OF_RENDERERS = frozenset(_NAMES) - {"color", "current", "recent", "length"}
 
 
 def _flatten(frame: Frame) -> tuple[list[Any], tuple[tuple[str, ...], Hints]]:

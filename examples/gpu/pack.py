@@ -26,7 +26,7 @@ from mcdenoise.train.front import Front, split
 
 FEATURES = frozenset({"albedo", "normal"})
 FIXED = ("current", "albedo", "normal", "reference")
-HISTORY = ("color", "length")
+HISTORY = ("color", "recent", "length")
 # The last bits of a half float that are dropped.
 DROPPED = 4
 # Height and width of a tile; all images are cut into tiles, so that they fit into one tensor.

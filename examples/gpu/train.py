@@ -72,7 +72,7 @@ class Tiles:
 
     def __post_init__(self) -> None:
         self.fixed = torch.empty(0, sum(CHANNELS.values()), *TILE, dtype=torch.float16, device=self.device)
-        self.history = torch.empty(0, 4, *TILE, dtype=torch.float16, device=self.device)
+        self.history = torch.empty(0, 7, *TILE, dtype=torch.float16, device=self.device)
         self.update()
         if not self.takes:
             raise InputError(f"{self.folder}: expected parts that pack.py has written, found none")
@@ -134,8 +134,8 @@ class Tiles:
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
     """Frames from their channels, and the reference."""
     current, albedo, normal, reference = fixed.split(list(CHANNELS.values()), 1)
-    frame = Frame(color=history[:, :3], current=current, length=history[:, 3:], albedo=albedo, normal=normal)
-    return frame, reference
+    color, recent, length = history.split([3, 3, 1], 1)
+    return Frame(color, current=current, recent=recent, length=length, albedo=albedo, normal=normal), reference
 
 
 def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Frame, Tensor]:
@@ -147,31 +147,30 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
     def permuted(image: Tensor, by: Tensor) -> Tensor:
         return image.gather(1, by[:, :, None, None].expand_as(image))
 
-    current, color, albedo, reference = (
-        permuted(e, order) for e in (frame.current, frame.color, frame.albedo, reference)
-    )
+    shown = (frame.current, frame.color, frame.recent, frame.albedo, reference)
+    current, color, recent, albedo, reference = (permuted(image, order) for image in shown)
     signs = (torch.rand(clips, 3, device=device) > 0.5).float().mul(2).sub(1)
     normal = permuted(frame.normal, axes) * signs[:, :, None, None]
     stops = config.exposure * (2 * rand[0] - 1)[:, None] + config.tint * (2 * torch.rand(clips, 3, device=device) - 1)
     factor = torch.exp2(stops)[:, :, None, None]
     if config.key:
         factor = factor * auto_exposure(reference, config.key)
-    current, color, reference = (image * factor for image in (current, color, reference))
+    current, color, recent, reference = (image * factor for image in (current, color, recent, reference))
     young = (rand[1] < YOUNG).reshape(-1, 1, 1, 1)
-    color, length = torch.where(young, current, color), torch.where(young, 1, frame.length)
+    color, recent = (torch.where(young, current, image) for image in (color, recent))
+    length = torch.where(young, 1, frame.length)
     if config.lamps:
         inside, radiance, grey = lamps(reference, rand, config)
         albedo = torch.where(inside, grey, albedo)
         light = demodulate(radiance, grey.expand_as(radiance))
-        color, current = (torch.where(inside, light, image) for image in (color, current))
+        color, recent, current = (torch.where(inside, light, image) for image in (color, recent, current))
         reference = torch.where(inside, radiance, reference)
     normal = normal * (rand[3] > BARE).reshape(-1, 1, 1, 1)
     bare = (rand[3] < BARE / 2).reshape(-1, 1, 1, 1)
-    color, current = (torch.where(bare, remodulate(image, albedo), image) for image in (color, current))
+    color, recent, current = (torch.where(bare, remodulate(image, albedo), image) for image in (color, recent, current))
     albedo = torch.where(bare, 1, albedo)
-    given = {"color": color, "current": current, "length": length, "albedo": albedo, "normal": normal}
-    given = {name: image.contiguous(memory_format=torch.channels_last) for name, image in given.items()}
-    return Frame(**given), reference
+    frame = Frame(color, current=current, recent=recent, length=length, albedo=albedo, normal=normal)
+    return frame.map(lambda image: image.contiguous(memory_format=torch.channels_last)), reference
 
 
 def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:

@@ -130,10 +130,11 @@ class Accumulated(Wrapper):
     """Blends each frame with the reprojected history of its shot, and passes the result to a method.
 
     The method sees the accumulated radiance as ``color``, that of the frame alone as ``current``, and the ``length`` of
-    the history; whether nothing moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a
-    cut (less than 5 % of the pixels find their surface in the previous frame), when the image's size changes, where a
-    frame has no motion, and where a buffer of ``also`` is in only one of two successive frames. The accumulated image
-    is the stage ``accumulated``.
+    the history; where lag is looked for, the radiance of about the last four frames as ``recent``; whether nothing
+    moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a cut (less than 5 % of the
+    pixels find their surface in the previous frame), when the image's size changes, where a frame has no motion, and
+    where a buffer of ``also`` is in only one of two successive frames. The accumulated image is the stage
+    ``accumulated``.
 
     Motion is the frame's own where it has one, else that of its previous positions (its positions, where it has none)
     seen from the previous camera. Where positions and cameras say that nothing moved, the motion is zero, not the
@@ -178,7 +179,7 @@ class Accumulated(Wrapper):
 
     stage, whole = "accumulate", True
     takes = MOTION | GUIDES | {"view_projection"}
-    gives = frozenset({"current", "length"})
+    gives = frozenset({"current", "recent", "length"})
 
     def __init__(
         self,
@@ -234,6 +235,8 @@ class Accumulated(Wrapper):
         after = found.history(frame, light) if keeps else None
         # Statistics of the noisy image are not passed on.
         made = {"color": found.color[:, COLOR], "current": found.entering[:, COLOR], "length": found.length}
+        if found.color.shape[1] > COLOR.stop:
+            made["recent"] = found.color[:, RECENT.start : RECENT_MEAN.start]
         given = frame.replace(**made, statistics={}, hints=frame.hints._replace(still=still))
         given = self._with_carried(given, found.carried)
         del frame, found, made

@@ -57,8 +57,8 @@ def _without_albedo(frame: Frame) -> Frame:
     assert albedo is not None
     changes: dict[str, Any] = {
         name: by_rows(demodulate, image, albedo)
-        for name, image in (("color", frame.color), ("current", frame.current), ("diffuse", frame.diffuse))
-        if image is not None
+        for name in ("color", "current", "recent", "diffuse")
+        if (image := frame.buffer(name)) is not None
     }
     changes["layers"] = {name: by_rows(demodulate, layer, albedo) for name, layer in frame.layers.items()}
     if frame.variance is not None:

@@ -2,8 +2,8 @@
 
 The layers are those of Open Image Denoise, and can start with the weights that it was published with. In the place of
 the library's noisy image they see a mean of the frame and of the accumulated radiance, which holds the samples of all
-frames that showed the same surface. A small network weighs both: the history has less noise, but is late or blurred
-where light changes and where pixels move by fractions. Beside it the layers see the frame, the accumulated radiance,
+frames that showed the same surface, or of the last four. A small network weighs them: a longer history has less noise,
+but is late or blurred where light changes and where pixels move by fractions. Beside it the layers see the frame, the accumulated radiance,
 and how long the history is. Each pixel of the result is a weighted mean of the network's own image and of these, so the
 error falls with every sample.
 """
@@ -27,6 +27,7 @@ from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
+from mcdenoise.ops._constants import RECENT_ALPHA
 from mcdenoise.ops._steps.transfer import compress
 from mcdenoise.ops._steps.wild import wild_choice, wild_input
 from mcdenoise.ops._window import corner, up_to_multiple
@@ -39,19 +40,23 @@ _CHANNELS = 9 + 3 + 3 + 1
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -12.0  # that of the network's image, while its weights are random
 _PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
-# The network for the weight of the history: side of the blocks that it sees, channels, and the initial logit.
-_BLOCK, _WIDTH, _TRUST = 4, 24, 1.5
-_FIGURES = 11
+# The network for the weights of the history: side of the blocks that it sees, channels, and the initial logits.
+_BLOCK, _WIDTH, _TRUST = 4, 24, (1.5, 0.0)
+_FIGURES = 17
+# Pairs of frame, recent and whole history, which are compared.
+_FIRSTS, _SECONDS = [0, 1, 0], [2, 2, 1]
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
 
 class Trust(nn.Module):
-    """The weight of the accumulated radiance beside the frame, from what both show in blocks of 4x4 pixels.
+    """The weights of the accumulated radiance beside the frame, and of all its frames beside the recent ones.
 
-    Of each block it sees the means of both, the mean absolute difference, the difference of the means, both standard
-    deviations, and the part of the history: a difference of single pixels is noise, one of means is late light. And the
-    standard deviations of albedo and normal, and how many pixels show a surface at all: a background has no noise, and
-    radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes.
+    It sees blocks of 4x4 pixels. A long history has less noise; but it is late where light or reflections move, blurred
+    where pixels move by fractions, and noise that neighbours share stays in it. Of the frame, the recent and the whole
+    history it sees the means, the standard deviations, and for each two of them the mean absolute difference and the
+    difference of the means: a difference of single pixels is noise, one of means is late light. And the part of the
+    history, the standard deviations of albedo and normal, and how many pixels show a surface at all: a background has
+    no noise, and radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes.
     """
 
     reach = 3 * _BLOCK + 2 * _BLOCK
@@ -61,20 +66,27 @@ class Trust(nn.Module):
         layers: list[nn.Module] = []
         for entering in (_FIGURES, _WIDTH, _WIDTH):
             layers += [nn.Conv2d(entering, _WIDTH, 3, padding=1, padding_mode="replicate"), nn.ReLU()]
-        self.layers, self.last = nn.Sequential(*layers), nn.Conv2d(_WIDTH, 1, 1)
+        self.layers, self.last = nn.Sequential(*layers), nn.Conv2d(_WIDTH, len(_TRUST), 1)
         assert self.last.bias is not None
         with torch.no_grad():
             self.last.weight.mul_(0.1 / _PACE)
-            self.last.bias.fill_(_TRUST / _PACE)
+            self.last.bias.copy_(torch.tensor(_TRUST) / _PACE)
 
     def forward(
-        self, alone: Tensor, color: Tensor, part: Tensor, albedo: Tensor | None, normal: Tensor | None
-    ) -> Tensor:
-        """The weight ``(B, 1, H, W)``.
+        self,
+        alone: Tensor,
+        recent: Tensor,
+        color: Tensor,
+        part: Tensor,
+        albedo: Tensor | None,
+        normal: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """The weights ``(B, 1, H, W)`` of the accumulated radiance, and of the whole history in it.
 
         Args:
             alone: ``(B, 3, H, W)`` the frame, in [0, 1] on the library's scale.
-            color: ``(B, 3, H, W)`` likewise, the accumulated radiance.
+            recent: ``(B, 3, H, W)`` likewise, the radiance of the recent history.
+            color: ``(B, 3, H, W)`` likewise, that of the whole history.
             part: ``(B, 1, H, W)`` part of the history in it.
             albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
             normal: likewise; ``None`` counts as zero.
@@ -82,27 +94,27 @@ class Trust(nn.Module):
         # In ONNX, bounds that are integers become tensors, which onnxscript loses if two steps clamp the same image.
         albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0.0, 1.0)
         normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1.0, 1.0)
-        own, both, surface = (image.mean(1, keepdim=True) for image in (alone, color, albedo))
-        apart, lengths = (own - both).abs(), normal.square().sum(1, keepdim=True)
-        each = torch.cat(
-            [own, both, surface, own * own, both * both, surface * surface, apart, part, lengths, normal], 1
-        )
+        shown = torch.cat([image.mean(1, keepdim=True) for image in (alone, recent, color, albedo)], 1)
+        apart = (shown[:, _FIRSTS] - shown[:, _SECONDS]).abs()
+        lengths = normal.square().sum(1, keepdim=True)
+        each = torch.cat([shown, shown.square(), apart, part, lengths, normal], 1)
         blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
-        means, squares, apart, part, lengths, normal = blocks.split([3, 3, 1, 1, 1, 3], 1)
+        means, squares, apart, part, lengths, normal = blocks.split([4, 4, 3, 1, 1, 3], 1)
         variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
-        own, both, _ = means.split(1, 1)
-        differences = torch.cat([apart, (own - both).abs(), variances.clamp_min(_LEAST**2).sqrt()], 1)
-        seen = [own, both, (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
+        between = (means[:, _FIRSTS] - means[:, _SECONDS]).abs()
+        differences = torch.cat([apart, between, variances.clamp_min(_LEAST**2).sqrt()], 1)
+        seen = [means[:, :3], (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
         logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
         wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
-        return corner(wide, *alone.shape[-2:])
+        trust, whole = corner(wide, *alone.shape[-2:]).split(1, 1)
+        return trust, whole
 
 
 class WildNetwork(nn.Module):
     """The network: ``expand(sum_i w_i x_i)`` over four images ``x_i`` on the library's scale of radiance.
 
-    They are the image that the network predicts, the frame, the accumulated radiance, and the mean of the last two, see
-    :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where
+    They are the image that the network predicts, the frame, the accumulated radiance (a mean of the recent and of the
+    whole history), and the mean of the last two, see :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where
     ``h`` is the part of the history in the accumulated radiance, ``1 - 1 / length``. So without a history only the
     network's image and the radiance have a weight; a background has none. Radiance is taken and returned without its
     albedo, as :class:`mcdenoise.models.Demodulated` divides it out; the network works on the products. A missing albedo
@@ -123,7 +135,7 @@ class WildNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.weight[3:].div_(_PACE)
             last.bias.zero_()[3].fill_(_LITTLE / _PACE)
-        uses, unet = frozenset({"current", "length", "albedo", "normal", "depth"}), self.unet
+        uses, unet = frozenset({"current", "recent", "length", "albedo", "normal", "depth"}), self.unet
         self.needs = Needs(uses=uses, reach=unet.reach + Trust.reach, stride=unet.multiple, live=unet.live)
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
@@ -138,11 +150,16 @@ class WildNetwork(nn.Module):
         history, alone = _lit(frame, color), _lit(frame, alone)
         mean, part = history, torch.zeros_like(color[:, :1])
         if frame.length is not None:
-            part = (1 - 1 / frame.length.clamp_min(1)).to(color.dtype)
+            recent = history if frame.recent is None else _lit(frame, frame.recent.to(color.dtype))
+            lengths = (frame.length.clamp_max(1 / RECENT_ALPHA), frame.length)
+            short, part = ((1 - 1 / length.clamp_min(1)).to(color.dtype) for length in lengths)
             if (behind := _background(frame)) is not None:
-                part, history = torch.where(behind, 0, part), torch.where(behind, alone, history)
-            shown = (compress(image * exposure) for image in (alone, history))
-            mean = torch.lerp(alone, history, self.trust(*shown, part, albedo, frame.normal))
+                short, part = (torch.where(behind, 0, each) for each in (short, part))
+                recent, history = (torch.where(behind, alone, image) for image in (recent, history))
+            shown = (compress(image * exposure) for image in (alone, recent, history))
+            trust, whole = self.trust(*shown, part, albedo, frame.normal)
+            history, part = torch.lerp(recent, history, whole), torch.lerp(short, part, whole)
+            mean = torch.lerp(alone, history, trust)
         seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
         image, logits = corner(self.unet(seen), *frame.size).split([3, len(_LOGITS)], 1)
         predicted = torch.cat([image, _PACE * logits], 1)

@@ -176,7 +176,7 @@ class ClipSampler:
         albedo = torch.rand(1, 1, 1, 1).expand(1, 3, 1, 1) * _randint(2)
         normal = normalize(torch.randn(1, 3, 1, 1), dim=1)
         light = demodulate(radiance, albedo) if demodulated else radiance
-        painted = {name: light for name in ("color", "current")}
+        painted = {name: light for name in ("color", "current", "recent")}
         painted |= {"albedo": albedo, "normal": normal, "reference": radiance}
         # Depth, motion and history are not changed: the lamp lies on the surface. It has no albedo and no noise.
         painted |= dict.fromkeys(("emission", NOISY, OIDN, OIDN_CLEAN), radiance)

@@ -153,10 +153,12 @@ def _processed(arrays: Mapping[str, Array], front: Front, start: int, first: int
     """The frames from ``first`` on, as the front processes them with a history that begins at ``start``."""
     step, made = front.begin(), {name: list[Array]() for name in front.parts}
     for t in range(start, len(arrays["color"])):
-        seen = dict(step(frame_of(arrays, t)).items())
+        seen = step(frame_of(arrays, t))
         for name, images in made.items() if t >= first else ():
-            images.append(seen[name].numpy())
-    return {name: np.concatenate(images) for name, images in made.items()}
+            # There is no recent history where no lag is looked for.
+            if (image := seen.buffer(name)) is not None:
+                images.append(image.numpy())
+    return {name: np.concatenate(images) for name, images in made.items() if images}
 
 
 def _packed(shard: Shard, names: frozenset[str] | None, noise_seed: int) -> dict[str, Array]:

@@ -16,7 +16,7 @@ from mcdenoise.models.demodulated import remodulated
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 
 # Buffers that accumulation and Open Image Denoise provide, with their channels.
-ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "length": 1}
+ACCUMULATED: Mapping[str, int] = {"color": 3, "current": 3, "recent": 3, "length": 1}
 _PARTS = frozenset(RADIANCE) - ACCUMULATED.keys()
 GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, OIDN_ALBEDO: 3, NOISY: 3, CENTRED: 1}
 

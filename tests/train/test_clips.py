@@ -27,8 +27,8 @@ def clip_of(stack: Tensor) -> Clip:
 
 def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
     """A shot in which every value is another whole number: channel, frame, row and column can be read off."""
-    count = length * 17 * height * width
-    return torch.arange(1.0, count + 1).reshape(length, 17, height, width)
+    count = length * sum(PARTS.values()) * height * width
+    return torch.arange(1.0, count + 1).reshape(length, -1, height, width)
 
 
 def orbit(clip: Tensor) -> list[Tensor]:

@@ -18,7 +18,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
 
 # Buffers to which the user may map a layer.
-MAPPABLE = sorted(set(BUFFERS) - {"current", "length"})
+MAPPABLE = sorted(set(BUFFERS) - {"current", "recent", "length"})
 _ALL, _LOWEST = slice(None), slice(-16, None)
 # Rec. 709 to XYZ (ITU-R BT.709), and the largest difference of a converted color relative to the light of a pixel.
 _TO_XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
