@@ -2,10 +2,10 @@
 
 The layers are those of Open Image Denoise, and can start with the weights that it was published with. In the place of
 the library's noisy image they see a mean of the frame and of the accumulated radiance, which holds the samples of all
-frames that showed the same surface, or of the last four. A small network weighs them: a longer history has less noise,
-but is late or blurred where light changes and where pixels move by fractions. Beside it the layers see the frame, the accumulated radiance,
-and how long the history is. Each pixel of the result is a weighted mean of the network's own image and of these, so the
-error falls with every sample.
+frames that showed the same surface, or only of the last four. A small network weighs them: a longer history has less
+noise, but is late or blurred where light changes and where pixels move by fractions. Beside it the layers see the
+frame, the accumulated radiance, and how long the history is. Each pixel of the result is a weighted mean of the
+network's own image and of these, so the error falls with every sample.
 """
 
 from __future__ import annotations
@@ -114,11 +114,11 @@ class WildNetwork(nn.Module):
     """The network: ``expand(sum_i w_i x_i)`` over four images ``x_i`` on the library's scale of radiance.
 
     They are the image that the network predicts, the frame, the accumulated radiance (a mean of the recent and of the
-    whole history), and the mean of the last two, see :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with predicted logits ``l`` and ``a = (1, h, h, 1)``, where
-    ``h`` is the part of the history in the accumulated radiance, ``1 - 1 / length``. So without a history only the
-    network's image and the radiance have a weight; a background has none. Radiance is taken and returned without its
-    albedo, as :class:`mcdenoise.models.Demodulated` divides it out; the network works on the products. A missing albedo
-    counts as one, a missing normal as zero.
+    whole history), and the mean of the last two, see :class:`Trust`: ``w = a softmax(l) / sum(a softmax(l))`` with
+    predicted logits ``l`` and ``a = (1, h, h, 1)``, where ``h`` is the part of the history in the accumulated radiance,
+    ``1 - 1 / length``. So without a history only the network's image and the radiance have a weight; a background has
+    none. Radiance is taken and returned without its albedo, as :class:`mcdenoise.models.Demodulated` divides it out;
+    the network works on the products. A missing albedo counts as one, a missing normal as zero.
 
     Args:
         size: see :class:`mcdenoise.nn.oidn.OidnUNet`.
