@@ -62,7 +62,7 @@ class Server:
 
     def __init__(self) -> None:
         # OpenMP threads do not survive a fork, and a forked process that waits for them hangs.
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
         command, pipe = [sys.executable, __file__], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
 
