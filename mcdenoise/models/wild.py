@@ -43,8 +43,6 @@ _PACE = 16.0  # factor of all logits, by which they learn faster than the layers
 # The network for the weights of the history: side of the blocks that it sees, channels, and the initial logits.
 _BLOCK, _WIDTH, _TRUST = 4, 24, (1.5, 0.0)
 _FIGURES = 17
-# Pairs of frame, recent and whole history, which are compared.
-_FIRSTS, _SECONDS = [0, 1, 0], [2, 2, 1]
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
 
@@ -95,14 +93,12 @@ class Trust(nn.Module):
         albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0.0, 1.0)
         normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1.0, 1.0)
         shown = torch.cat([image.mean(1, keepdim=True) for image in (alone, recent, color, albedo)], 1)
-        apart = (shown[:, _FIRSTS] - shown[:, _SECONDS]).abs()
         lengths = normal.square().sum(1, keepdim=True)
-        each = torch.cat([shown, shown.square(), apart, part, lengths, normal], 1)
+        each = torch.cat([shown, shown.square(), _apart(shown), part, lengths, normal], 1)
         blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
         means, squares, apart, part, lengths, normal = blocks.split([4, 4, 3, 1, 1, 3], 1)
         variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
-        between = (means[:, _FIRSTS] - means[:, _SECONDS]).abs()
-        differences = torch.cat([apart, between, variances.clamp_min(_LEAST**2).sqrt()], 1)
+        differences = torch.cat([apart, _apart(means), variances.clamp_min(_LEAST**2).sqrt()], 1)
         seen = [means[:, :3], (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
         logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
         wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
@@ -165,6 +161,12 @@ class WildNetwork(nn.Module):
         predicted = torch.cat([image, _PACE * logits], 1)
         image = wild_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
         return answered(frame, image if albedo is None else demodulate(image, albedo)), None
+
+
+def _apart(images: Tensor) -> Tensor:
+    """How far frame, recent and whole history differ."""
+    alone, recent, color, _ = images.split(1, 1)
+    return torch.cat([alone - color, recent - color, alone - recent], 1).abs()
 
 
 def _lit(frame: Frame, image: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 from typing import Any
 
 import pytest
@@ -26,8 +25,9 @@ has_oidn = pytest.mark.skipif(
 def given(length: float) -> Frame:
     """A frame with this many frames of history."""
     frame = frame_of(*SIZE).to(torch.float64)
-    alone = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    return frame.replace(current=alone, length=torch.full((1, 1, *SIZE), length, dtype=torch.float64))
+    alone, recent = torch.rand(2, 1, 3, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    length_of_all = torch.full((1, 1, *SIZE), length, dtype=torch.float64)
+    return frame.replace(current=alone, recent=recent, length=length_of_all)
 
 
 def network(own: float, logits: tuple[float, ...]) -> WildNetwork:
@@ -40,20 +40,24 @@ def network(own: float, logits: tuple[float, ...]) -> WildNetwork:
         made.unet.last.weight.zero_()
         bias.zero_()[:7] = torch.tensor(predicted, dtype=torch.float64)
         made.trust.last.weight.zero_()
-        made.trust.last.bias.fill_(math.log(0.7 / 0.3) / _PACE)
+        # Weights of the history, and of its older frames.
+        made.trust.last.bias.copy_(torch.tensor([0.7, 0.4], dtype=torch.float64).logit() / _PACE)
     return made
 
 
-@pytest.mark.parametrize("length", [1.0, 4.0, None])
+@pytest.mark.parametrize("length", [1.0, 3.0, 9.0, None])
 def test_the_image_is_the_weighted_mean_of_four_images(length: float | None) -> None:
     logits, frame = (0.4, -0.2, 0.1, -0.5), given(length or 1)
-    frame = frame if length else frame.replace(length=None, current=None)
+    frame = frame if length else frame.replace(length=None, current=None, recent=None)
     image = network(0.31, logits)(frame)[0].image
     albedo, alone = frame.albedo, frame.color if frame.current is None else frame.current
     assert albedo is not None
     lit, history = (remodulate(each, albedo) for each in (alone, frame.color))
+    exposure, part = oidn_exposure(history), 0.0
+    if length is not None and frame.recent is not None:
+        history = 0.4 * history + 0.6 * remodulate(frame.recent, albedo)
+        part = 0.4 * (1 - 1 / length) + 0.6 * (1 - 1 / min(length, 4))
     images = [lit, history, torch.lerp(lit, history, 0.7)]
-    exposure, part = oidn_exposure(history), 0.0 if length is None else 1 - 1 / length
     weights = torch.softmax(torch.tensor(logits, dtype=torch.float64), 0) * torch.tensor(
         [1, part, part, 1], dtype=torch.float64
     )
@@ -62,17 +66,20 @@ def test_the_image_is_the_weighted_mean_of_four_images(length: float | None) -> 
     torch.testing.assert_close(image, demodulate(expand(expected) / exposure, albedo), rtol=1e-12, atol=1e-12)
 
 
-def test_the_weight_of_the_history_tells_late_light_from_noise() -> None:
+@pytest.mark.parametrize("which", [0, 1], ids=["frame", "recent"])
+def test_the_weights_of_the_history_tell_late_light_from_noise(which: int) -> None:
     """The figures, not the weights, which are random: noise of single pixels, or another mean of the whole block."""
     torch.manual_seed(0)
     trust, flat = Trust().double(), torch.full((1, 3, *SIZE), 0.5, dtype=torch.float64)
     part, noise = torch.full_like(flat[:, :1], 0.9), 0.1 * torch.ones_like(flat)
     noise[..., ::2] *= -1
 
-    def weight(alone: torch.Tensor) -> torch.Tensor:
-        return trust(alone, flat, part, None, None)
+    def weight(image: torch.Tensor) -> torch.Tensor:
+        images = [flat, flat, flat]
+        images[which] = image
+        return torch.cat(trust(*images, part, None, None), 1)
 
-    assert weight(flat).shape == (1, 1, *SIZE)
+    assert weight(flat).shape == (1, 2, *SIZE)
     torch.testing.assert_close(weight(flat + noise), weight(flat - noise))
     assert not torch.allclose(weight(flat + noise), weight(flat + 0.1))
 

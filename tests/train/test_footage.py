@@ -299,7 +299,7 @@ def test_the_frames_that_are_kept_have_the_history_of_all(tmp_path: Path) -> Non
     assert second in (2, 4)
     for shot, start in ((whole, 0), (later, second)):
         read = shot.read()
-        assert set(read) == {"color", "current", "length", "albedo", "reference"}
+        assert set(read) == {"color", "current", "recent", "length", "albedo", "reference"}
         torch.testing.assert_close(read["color"], accumulated(shard, start), rtol=1e-3, atol=1e-3)
         part = shot.cut(slice(1, 3)).read(rows=slice(2, 9))
         assert all(torch.equal(part[name], read[name][1:, :, 2:9]) for name in read)
