@@ -28,7 +28,7 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._constants import RECENT_ALPHA
-from mcdenoise.ops._steps.transfer import compress
+from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress
 from mcdenoise.ops._steps.wild import wild_choice, wild_input
 from mcdenoise.ops._window import corner, up_to_multiple
 from mcdenoise.ops.lag import THRESHOLD
@@ -42,7 +42,7 @@ _LITTLE = -12.0  # that of the network's image, while its weights are random
 _PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
 # The network for the weights of the history: side of the blocks that it sees, channels, and the initial logits.
 _BLOCK, _WIDTH, _TRUST = 4, 24, (1.5, 0.0)
-_FIGURES = 17
+_FIGURES = 20
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
 
@@ -52,12 +52,13 @@ class Trust(nn.Module):
     It sees blocks of 4x4 pixels. A long history has less noise; but it is late where light or reflections move, blurred
     where pixels move by fractions, and noise that neighbours share stays in it. Of the frame, the recent and the whole
     history it sees the means, the standard deviations, and for each two of them the mean absolute difference and the
-    difference of the means: a difference of single pixels is noise, one of means is late light. And the part of the
-    history, the standard deviations of albedo and normal, and how many pixels show a surface at all: a background has
-    no noise, and radiance through a pixel filter, divided by an albedo without one, is wrong where the albedo changes.
+    differences of the means of 4x4 and of 16x16 pixels: a difference of single pixels is noise, one of means is late
+    light. And the part of the history, the standard deviations of albedo and normal, and how many pixels show a surface
+    at all: a background has no noise, and radiance through a pixel filter, divided by an albedo without one, is wrong
+    where the albedo changes.
     """
 
-    reach = 3 * _BLOCK + 2 * _BLOCK
+    reach = (3 + 2 + 6) * _BLOCK
 
     def __init__(self) -> None:
         super().__init__()
@@ -82,9 +83,9 @@ class Trust(nn.Module):
         """The weights ``(B, 1, H, W)`` of the accumulated radiance, and of the whole history in it.
 
         Args:
-            alone: ``(B, 3, H, W)`` the frame, in [0, 1] on the library's scale.
-            recent: ``(B, 3, H, W)`` likewise, the radiance of the recent history.
-            color: ``(B, 3, H, W)`` likewise, that of the whole history.
+            alone: ``(B, 3, H, W)`` radiance of the frame, times the exposure.
+            recent: ``(B, 3, H, W)`` likewise, of the recent history.
+            color: ``(B, 3, H, W)`` likewise, of the whole history.
             part: ``(B, 1, H, W)`` part of the history in it.
             albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
             normal: likewise; ``None`` counts as zero.
@@ -92,13 +93,18 @@ class Trust(nn.Module):
         # In ONNX, bounds that are integers become tensors, which onnxscript loses if two steps clamp the same image.
         albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0.0, 1.0)
         normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1.0, 1.0)
-        shown = torch.cat([image.mean(1, keepdim=True) for image in (alone, recent, color, albedo)], 1)
+        images = [image.clamp_max(MAX_RADIANCE) for image in (alone, recent, color)]
+        light = torch.cat([image.mean(1, keepdim=True) for image in images], 1)
+        shown = torch.cat([image.mean(1, keepdim=True) for image in (*map(compress, images), albedo)], 1)
         lengths = normal.square().sum(1, keepdim=True)
-        each = torch.cat([shown, shown.square(), _apart(shown), part, lengths, normal], 1)
+        each = torch.cat([shown, shown.square(), _apart(shown), part, lengths, normal, light], 1)
         blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
-        means, squares, apart, part, lengths, normal = blocks.split([4, 4, 3, 1, 1, 3], 1)
+        means, squares, apart, part, lengths, normal, light = blocks.split([4, 4, 3, 1, 1, 3, 3], 1)
+        # Means of radiance, which noise does not change.
+        far = _apart(compress(F.avg_pool2d(light, 4, ceil_mode=True, count_include_pad=False)))
+        far = corner(F.interpolate(far, scale_factor=4, mode="bilinear", align_corners=False), *part.shape[-2:])
         variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
-        differences = torch.cat([apart, _apart(means), variances.clamp_min(_LEAST**2).sqrt()], 1)
+        differences = torch.cat([apart, _apart(means), far, variances.clamp_min(_LEAST**2).sqrt()], 1)
         seen = [means[:, :3], (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
         logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
         wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
@@ -152,8 +158,8 @@ class WildNetwork(nn.Module):
             if (behind := _background(frame)) is not None:
                 short, part = (torch.where(behind, 0, each) for each in (short, part))
                 recent, history = (torch.where(behind, alone, image) for image in (recent, history))
-            shown = (compress(image * exposure) for image in (alone, recent, history))
-            trust, whole = self.trust(*shown, part, albedo, frame.normal)
+            exposed = (image * exposure for image in (alone, recent, history))
+            trust, whole = self.trust(*exposed, part, albedo, frame.normal)
             history, part = torch.lerp(recent, history, whole), torch.lerp(short, part, whole)
             mean = torch.lerp(alone, history, trust)
         seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
@@ -165,7 +171,7 @@ class WildNetwork(nn.Module):
 
 def _apart(images: Tensor) -> Tensor:
     """How far frame, recent and whole history differ."""
-    alone, recent, color, _ = images.split(1, 1)
+    alone, recent, color, *_ = images.split(1, 1)
     return torch.cat([alone - color, recent - color, alone - recent], 1).abs()
 
 

@@ -29,6 +29,9 @@ LAG_WINDOW = 5
 # For a second, shorter history: the smallest weight of a frame, so that four frames have half the noise of one; and how
 # many equally weighted frames have its noise once it is full, (2 - alpha) / alpha.
 RECENT_ALPHA, RECENT_FRAMES = 0.25, 7
+# Side of the blocks, 3x3 of which tell how much the light has changed; the squared standard errors up to which that is
+# noise, twice those of a lag because neighbouring pixels share noise; and the factors of a root that are possible.
+RELIT_BLOCK, RELIT_DOUBT, RELIT = 16, 8.0, (0.7, 1.4)
 # Largest motion, in pixels, that counts as standing still.
 STILL = 0.05
 # A light that is seen: how far the compressed radiance of 3x3 pixels may differ, and how bright they are beside the

@@ -21,7 +21,7 @@ from mcdenoise.ops._constants import (
     RECENT_FRAMES,
     SMALLEST_LAG,
 )
-from mcdenoise.ops._history import Blended
+from mcdenoise.ops._history import MEAN, Blended, light_changes
 from mcdenoise.ops._numba._runtime import add, compiled, copy_row, read_row, share_rows, source
 from mcdenoise.ops._numba.temporal import Shorter, between, blended
 from mcdenoise.ops._surface import Surface
@@ -187,6 +187,7 @@ def blend(
     )
     if not math.isinf(lag_threshold):
         _discard_lag(color, length, entering, lag_threshold, recent_alpha)
+        color *= light_changes(color, length, entering[:, MEAN])
     return Blended(color, length, counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1))
 
 

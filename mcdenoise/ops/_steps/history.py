@@ -18,7 +18,7 @@ from mcdenoise.ops._constants import (
     RECENT_FRAMES,
     STILL,
 )
-from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended
+from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._surface import Rule, Surface
 from mcdenoise.ops._window import corner
@@ -186,7 +186,8 @@ def blend(
     3. With a finite ``lag_threshold``, histories are replaced by shorter ones as far as
        :func:`mcdenoise.ops.history_lag` says, of the fourth roots of radiance, in half the resolution: a second
        history of about four frames for the current frame, and the long one for that. The variance of the noise is the
-       variance of the root over the history. The decision has no derivative.
+       variance of the root over the history. Then both are scaled by the change of the light that larger windows
+       show, see :func:`mcdenoise.ops._history.light_changes`. The decisions have no derivative.
 
     Args:
         entering: ``(B, 5, H, W)`` of :func:`incoming`; any number of channels without a test for lag.
@@ -264,7 +265,8 @@ def _without_lag(
     given_up = _lag(threshold, mean, recent[:, 3:], variance / length.clamp_max(RECENT_FRAMES))
     shorter = torch.cat([recent, recent[:, 3:].square() + variance], 1)
     longer = torch.lerp(blended[:, : RECENT.start], shorter, given_up)
-    return torch.cat([longer, recent], 1), torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)
+    history, length = torch.cat([longer, recent], 1), torch.lerp(length, length.clamp_max(1 / recent_alpha), given_up)
+    return history * light_changes(history, length, color[:, MEAN]), length
 
 
 def _lag(threshold: float, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
