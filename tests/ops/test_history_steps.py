@@ -10,6 +10,7 @@ from reference_cases import slice_of_pixels, transposed
 from torch import Tensor
 
 from mcdenoise.ops import Surface, motion_from_position, use
+from mcdenoise.ops._history import light_changes
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import history as steps
 
@@ -178,3 +179,33 @@ def test_layout_in_memory_and_threads_change_nothing(
         torch.set_num_threads(count)
         for a, b in zip(passed(laid_out, "numba"), expected, strict=True):
             assert all(map(torch.equal, a, b))
+
+
+@pytest.mark.parametrize("root", [0.9, 1.0, 1.02, 1.2, 3.0])
+def test_the_change_of_the_light_is_a_james_stein_estimate(root: float) -> None:
+    size, variance, length = (1, 1, 70, 90), 0.1, 5.0
+    history = torch.ones(1, 9, 70, 90, dtype=torch.float64)
+    history[:, steps.SQUARE] += variance * (length - 1) / length
+    lengths = torch.full(size, length, dtype=torch.float64)
+    factors = light_changes(history, lengths, torch.full(size, root, dtype=torch.float64))
+    change = root - 1
+    kept = max(1 - 8 * variance / (48 * 48 * change**2), 0) if change else 0
+    one = min(max(1 + kept * change, 0.7), 1.4)
+    powers = torch.tensor([4, 4, 4, 1, 2, 4, 4, 4, 1], dtype=torch.float64).reshape(1, 9, 1, 1)
+    torch.testing.assert_close(factors, (one**powers).expand_as(factors), rtol=1e-12, atol=1e-12)
+    assert light_changes(history, torch.ones_like(lengths), 1.1 * torch.ones_like(lengths)).eq(1).all()
+
+
+@pytest.mark.parametrize("light", [1.0, 0.8, 1.25])
+def test_a_history_follows_a_change_of_the_light_that_noise_hides(light: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    history, length = torch.empty(0), torch.empty(0)
+    for number in range(17):
+        noise = -torch.rand(1, 3, 96, 96, generator=generator).clamp_min(1e-6).log()
+        entering = steps.incoming(noise * (light if number == 16 else 1))
+        if number:
+            history, length, _ = steps.blend(entering, history, length, None, alpha_min=0.03, lag_threshold=2.0)
+        else:
+            history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])
+    # A mean of 17 frames would follow a seventeenth of the way.
+    assert abs(float(history[:, steps.COLOR].mean()) / light - 1) < 0.03
