@@ -139,7 +139,9 @@ def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
 def oidn_exposure(color: Tensor) -> Tensor:
     """The factor by which Open Image Denoise scales an image's radiance.
 
-    ``0.18 / exp2(mean(log2(luminance)))`` over the means of bins of about 16x16 pixels, without black ones.
+    ``0.18 / exp2(mean(log2(luminance)))`` over the means of bins of about 16x16 pixels, without black ones. In an image
+    whose mean is below 1, what counts as black falls with the mean, unlike in the library, which takes a dim image for
+    a black one.
 
     Args:
         color: ``(B, 3, H, W)`` radiance.
@@ -151,9 +153,10 @@ def oidn_exposure(color: Tensor) -> Tensor:
     weights = numbers_like(color, _LUMINANCE).reshape(1, _COLORS, 1, 1)
     luminance = (color * weights).sum(1, keepdim=True)
     bins = _binned(_binned(luminance, 2), 3)
-    lit = bins > _DARK
+    dark = _DARK * bins.mean((1, 2, 3), keepdim=True).clamp(1e-30, 1.0)
+    lit = bins > dark
     count = lit.sum((1, 2, 3), keepdim=True)
-    mean = torch.where(lit, torch.log2(bins.clamp_min(_DARK)), 0).sum((1, 2, 3), keepdim=True) / count.clamp_min(1)
+    mean = torch.where(lit, torch.log2(bins.maximum(dark)), 0).sum((1, 2, 3), keepdim=True) / count.clamp_min(1)
     return torch.where(count > 0, _KEY / torch.exp2(mean), 1)
 
 

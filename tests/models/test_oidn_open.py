@@ -245,6 +245,12 @@ def test_exposure_bin_by_bin(size: tuple[int, int]) -> None:
     assert oidn_exposure(torch.zeros(2, 3, 20, 20)).flatten().tolist() == [1, 1]
 
 
+@pytest.mark.parametrize("factor", [2.0**-60, 2.0**-100])
+def test_a_dim_image_has_the_exposure_of_a_bright_one(factor: float) -> None:
+    color = lit(40, 33).color
+    assert (oidn_exposure(factor * color) * factor).item() == pytest.approx(oidn_exposure(color).item(), rel=1e-5)
+
+
 def archive(tensors: dict[str, np.ndarray[Any, Any]], before: bytes = b"") -> bytes:
     """An archive as the library's scripts write it: values on multiples of 64, and the table behind them."""
     values, table = b"", struct.pack("<I", len(tensors))
