@@ -6,9 +6,12 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import RADIANCE, Frame, Skip, scale_samples
-from mcdenoise.models._interface import Output, State, prepared
-from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models._interface import Model, Output, State, prepared
+from mcdenoise.models._wrapper import Wrapper, parts_of
+from mcdenoise.models.accumulated import Accumulated
+from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.nn.inputs import auto_exposure
 
 
@@ -18,8 +21,21 @@ class Exposed(Wrapper):
     This makes a method independent of the unit of radiance: ``model(s x) = s model(x)``.
 
     Args:
-        inner: any method.
+        inner: any method but one that keeps radiance for the next frame, whose exposure is another.
+
+    Raises:
+        InputError: an :class:`mcdenoise.models.Accumulated` or :class:`mcdenoise.models.Recurrent` is inside.
     """
+
+    def __init__(self, inner: Model) -> None:
+        super().__init__(inner)
+        for part in parts_of(self.inner, Wrapper):
+            if isinstance(part, Accumulated | Recurrent):
+                name = type(part).__name__
+                raise InputError(
+                    f"Exposed: expected no {name} inside, whose history would have the exposure of earlier frames; "
+                    f"put it around: {name}(Exposed(...))"
+                )
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure, and the statistics of the inner model for the exposed frame."""

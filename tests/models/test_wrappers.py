@@ -1,5 +1,6 @@
 """Wrappers of any method: demodulation, exposure, another method before it, lower resolutions."""
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 from toys import Blur, Brightest, Mean, Same, Watching, frame_of, still
 
+from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame, Hints, Skip
 from mcdenoise.models import (
     Accumulated,
@@ -24,6 +26,7 @@ from mcdenoise.models import (
 )
 from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._interface import prepared
+from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, remodulate
 
@@ -60,8 +63,9 @@ def test_a_wrapper_of_the_identity_returns_the_image(name: str) -> None:
     torch.testing.assert_close(output.image, frame.color, **ROUNDING)
 
 
-@pytest.mark.parametrize("outer", WRAPPERS)
-@pytest.mark.parametrize("inner", WRAPPERS)
+@pytest.mark.parametrize(
+    ("outer", "inner"), [pair for pair in itertools.product(WRAPPERS, repeat=2) if pair != ("exposed", "accumulated")]
+)
 def test_a_chain_of_one_method_is_that_method(outer: str, inner: str) -> None:
     """This holds also if the method's pixels depend on statistics, which are those of its own input."""
     frame = frame_of(40, 48)
@@ -175,6 +179,13 @@ def test_exposed_methods_do_not_depend_on_the_unit_of_radiance(
     bare = FromBuffers(method)
     unlike = bare(frame.replace(color=factor * frame.color))[0].image / factor
     assert not torch.allclose(unlike, bare(frame)[0].image, rtol=0.1)
+
+
+@pytest.mark.parametrize("history", [Accumulated, Recurrent])
+def test_a_history_in_the_exposure_of_earlier_frames_is_refused(history: type[Accumulated | Recurrent]) -> None:
+    with pytest.raises(InputError, match=rf"{history.__name__}\(Exposed"):
+        Exposed(Demodulated(history(double)))
+    history(Exposed(double))
 
 
 def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
