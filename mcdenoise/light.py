@@ -36,7 +36,7 @@ class Repairs(NamedTuple):
         filled: number of pixels without a value (NaN, or minus infinity in some channel), filled from around them.
         limited: number of pixels with infinite values, or values above 1e16.
         clamped: number of pixels with negative values.
-        negative: sum of the negative light of an image as a fraction of its light; the largest of a batch.
+        negative: sum of the negative light of a channel as a fraction of its light of both signs; the largest of all.
         gained: change of the mean of an image because of negative light; the largest of a batch.
         place: row and column of the most negative value.
     """
@@ -227,16 +227,23 @@ def repairs_from(numbers: Sequence[float], layers: Sequence[str]) -> Repairs:
         start = _COLOR_NUMBERS + _LAYER_NUMBERS * number
         broken, signed = numbers[start : start + _LAYER_NUMBERS]
         if broken > _MOST_BROKEN or signed > _MOST_NEGATIVE:
-            share = f"in {broken:.0%} of the pixels" if broken > _MOST_BROKEN else f"{signed:.0%} of its light negative"
+            share = f"{_share(signed):.0%} of its light negative"
+            if broken > _MOST_BROKEN:
+                share = f"in {broken:.0%} of the pixels"
             raise InputError(f"layer '{name}': expected radiance, not negative and finite, found {share}; leave it out")
     if empty:
         raise InputError("buffer 'color': expected radiance, found NaN in every pixel; render the frame again")
     if ratio > _MOST_NEGATIVE:
         raise InputError(
-            f"buffer 'color': expected radiance, not negative, found {ratio:.0%} as much negative light as positive, "
+            f"buffer 'color': expected radiance, not negative, found {_share(ratio):.0%} of the light negative, "
             "so it holds something else, such as a difference; give the radiance itself"
         )
     return Repairs(int(filled), int(limited), int(clamped), negative, gained, (int(row), int(column)))
+
+
+def _share(ratio: float) -> float:
+    """Negative light as a fraction of all light, from its ratio to the positive light, which may be infinite."""
+    return 1 / (1 + 1 / ratio) if ratio else 0.0
 
 
 def _hole(image: Tensor) -> Tensor:
@@ -267,7 +274,7 @@ def _negative(image: Tensor, hole: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     of_image = positive.sum((1, 2, 3)), negative.sum((1, 2, 3))
     ratio = torch.where(of_image[1] > _LEAST_NEGATIVE, of_image[1] / of_image[0].clamp_min(tiny), 0)
     light = (of_image[0] - of_image[1]).clamp_min(tiny) * image.shape[2] * image.shape[3]
-    return light, ratio, negative / (positive - negative).clamp_min(tiny)
+    return light, ratio, negative / (positive + negative).clamp_min(tiny)
 
 
 def _limited(image: Tensor, hole: Tensor, top: Tensor) -> Tensor:
