@@ -21,10 +21,10 @@ from mcdenoise.report.pictures import (
     data_uri,
     decode,
     encode,
-    halved,
+    smaller,
     to_srgb,
 )
-from mcdenoise.results import IMAGES, Method, Results, Scene
+from mcdenoise.results import IMAGES, Results, Scene
 
 REFERENCE = "reference"
 _THUMBNAIL_WIDTH = 480
@@ -89,7 +89,7 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
     """
     files = kept_pictures(folder, results, scene)
     codes = {
-        name: {number: encode(_smaller(read_picture(path, scene), factor)) for number, path in own.items()}
+        name: {number: encode(smaller(read_picture(path, scene), factor)) for number, path in own.items()}
         for name, own in files.items()
     }
     denoisers = {method.name for method in results.methods if method.kind != "baseline"}
@@ -120,18 +120,14 @@ def picture_pixels(folder: Path, results: Results) -> int:
 
 def kept_pictures(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
     """The files of the pictures that a benchmark in a folder kept, by method and frame, the reference last."""
-    sources = {method.name: method.folder for method in results.methods if _ran(results, scene, method)}
+    failed = {cell.method for cell in results.cells if cell.scene == scene.name and cell.failure}
+    sources = {method.name: method.folder for method in results.methods if method.name not in failed}
     found = {
         name: {number: folder / IMAGES / scene.name / place / f"{number}.exr" for number in scene.pictures}
         for name, place in (sources | {REFERENCE: REFERENCE}).items()
     }
     existing = {name: {number: path for number, path in own.items() if path.exists()} for name, own in found.items()}
     return {name: own for name, own in existing.items() if own}
-
-
-def _ran(results: Results, scene: Scene, method: Method) -> bool:
-    cell = results.cell(scene.name, method.name)
-    return not method.missing and cell is not None and not cell.failure
 
 
 def read_picture(path: Path, scene: Scene) -> Image:
@@ -148,12 +144,6 @@ def read_picture(path: Path, scene: Scene) -> Image:
         )
     image = torch.from_numpy(np.ascontiguousarray(pixels[..., :3])).permute(2, 0, 1)
     return np.ascontiguousarray(to_rec709(image, metadata).permute(1, 2, 0).numpy())
-
-
-def _smaller(image: Image, factor: int) -> Image:
-    while factor > 1:
-        image, factor = halved(image), factor // 2
-    return image
 
 
 def _close_ups(
@@ -176,7 +166,7 @@ def _close_ups(
     step = 1
     while scene.width // step > _THUMBNAIL_WIDTH:
         step *= 2
-    return close_ups, data_uri(to_srgb(_smaller(reference, step)), "jpeg", quality=88)
+    return close_ups, data_uri(to_srgb(smaller(reference, step)), "jpeg", quality=88)
 
 
 def _exposure(pictures: dict[int, Codes]) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import avg_pool2d
 
 from mcdenoise.metrics import display_codes, psnr_srgb, smape_linear
 
@@ -58,11 +59,10 @@ def to_srgb(radiance: Image) -> Codes:
     return np.asarray(display_codes(image.permute(2, 0, 1)).permute(1, 2, 0).numpy())
 
 
-def halved(radiance: Image) -> Image:
-    """Mean of 2x2 pixels; an odd last row or column is dropped."""
-    height, width = (length // 2 * 2 for length in radiance.shape[:2])
-    blocks = radiance[:height, :width].reshape(height // 2, 2, width // 2, 2, -1)
-    return np.asarray(blocks.mean((1, 3)), dtype=np.float32)
+def smaller(radiance: Image, factor: int) -> Image:
+    """Means of squares of so many pixels a side; rows and columns that do not fill one are dropped."""
+    image = torch.from_numpy(radiance).permute(2, 0, 1)[None]
+    return np.asarray(avg_pool2d(image, factor)[0].permute(1, 2, 0).numpy())
 
 
 def data_uri(pixels: Codes, image_format: str = "webp", **options: Any) -> str:

@@ -21,7 +21,7 @@ from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS
 from mcdenoise.report.views import Row, View, front, points
-from mcdenoise.results import STAGES, Cost, Method, Results
+from mcdenoise.results import STAGES, Method, Results
 
 # Okabe and Ito 2008, told apart with every kind of colour blindness; behind them four more, for ten models.
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f4fc9", "#8a4b20", "#6b8e00", "#c2185b")
@@ -164,7 +164,8 @@ def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
         return _empty(axes)
     fits = {fit.method: fit for fit in results.fits}
     for number, method in enumerate(results.methods, start=1):
-        own = sorted((_megapixels(cost), spread) for cost, spread in measured if cost.method == method.name)
+        own = [(cost.width * cost.height / 1e6, spread) for cost, spread in measured if cost.method == method.name]
+        own.sort()
         if not own:
             continue
         color = colors[method.model]
@@ -318,7 +319,3 @@ def _draw_idle(axes: Axes, rows: Sequence[Row], metric: str) -> None:
 def _write_number(axes: Axes, number: int, x: float, y: float, bold: bool = False) -> None:
     about: Any = {"textcoords": "offset points", "ha": "center", "va": "center", "zorder": 5}
     axes.annotate(f"{number}", (x, y), (8, 8), fontsize=9, fontweight="bold" if bold else "normal", **about)
-
-
-def _megapixels(cost: Cost) -> float:
-    return cost.width * cost.height / 1e6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +51,13 @@ def write_report(folder: Path) -> Path:
     results = shortlist(everything, _MOST_METHODS)
     galleries = _galleries(folder, results)
     shown = views(results)
-    first = _first_pair(shown[0], names)
+    # Open Image Denoise at its best, or else the best filter, and the best network.
+    rival, ours = (_best(shown[0], names, kind) for kind in ("fixed", "trainable"))
+    first = [(rival or shown[0].rows[0]).method.name, ours.method.name if ours else REFERENCE]
     content = {
         "results": results,
         "others": [method.name for method in everything.methods if method not in results.methods],
-        "verdict": _verdict(shown[0], names),
+        "verdict": _verdict(rival, ours, names[0]) if rival and ours else "",
         "created": f"{results.created[:16].replace('T', ' ')} UTC",
         "metrics": [_metric(name) for name in names],
         "columns": [_column(shown, name) for name in names],
@@ -69,7 +71,7 @@ def write_report(folder: Path) -> Path:
         "fits": {fit.method: fit for fit in results.fits},
         "galleries": galleries,
         "reference": REFERENCE,
-        "heat": {"end": _HEAT_END, "gradient": ", ".join(_css_rgb(color) for color in _heat_colors()[::15])},
+        "heat": {"end": _HEAT_END, "gradient": ", ".join(f"rgb({r} {g} {b})" for r, g, b in _heat_colors()[::15])},
         "brightest": f"{BRIGHTEST:g}",
         "close_ups": any(gallery.close_ups for gallery in galleries),
         "profiles": any(gallery.profiles for gallery in galleries),
@@ -234,25 +236,16 @@ def _best(view: View, names: list[str], kind: Kind) -> Row | None:
     return min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
 
 
-def _first_pair(view: View, names: list[str]) -> list[str]:
-    """The pictures to begin with: Open Image Denoise at its best (or else the best filter), and the best network."""
-    rival, ours = (_best(view, names, kind) for kind in ("fixed", "trainable"))
-    return [(rival or view.rows[0]).method.name, ours.method.name if ours else REFERENCE]
-
-
-def _verdict(view: View, names: list[str]) -> str:
-    """The best network beside the best of the others, in a sentence; empty without one of them."""
-    rival, ours = (_best(view, names, kind) for kind in ("fixed", "trainable"))
-    if rival is None or ours is None:
-        return ""
-    one, other = (row.errors[names[0]].value for row in (ours, rival))
-    if METRICS[names[0]].higher_is_better:
-        text = f"{ours.method.name}: {names[0]} {one:.3g}, {rival.method.name}: {other:.3g}"
+def _verdict(rival: Row, ours: Row, metric: str) -> str:
+    """The best network beside the best of the others, in a sentence; empty where they cannot be compared."""
+    one, other = (row.errors[metric].value for row in (ours, rival))
+    if METRICS[metric].higher_is_better:
+        text = f"{ours.method.name}: {metric} {one:.3g}, {rival.method.name}: {other:.3g}"
     elif other <= 0:
         return ""
     else:
         change = one / other - 1
-        text = f"{ours.method.name} has {abs(change):.0%} {'less' if change < 0 else 'more'} error ({names[0]}) than "
+        text = f"{ours.method.name} has {abs(change):.0%} {'less' if change < 0 else 'more'} error ({metric}) than "
         text += rival.method.name
     if ours.milliseconds and rival.milliseconds and rival.milliseconds.value > 0:
         ratio = ours.milliseconds.value / rival.milliseconds.value
@@ -292,7 +285,3 @@ def _heat_colors() -> list[list[int]]:
     import matplotlib
 
     return [[round(255 * part) for part in color[:3]] for color in map(matplotlib.colormaps["inferno"], range(256))]
-
-
-def _css_rgb(color: Iterable[int]) -> str:
-    return f"rgb({' '.join(map(str, color))})"
