@@ -153,9 +153,9 @@ def _to_mitsuba(mi: Any, value: Any, folder: Path, name: str = "") -> Any:
     if isinstance(value, Mapping):
         if value.get("type") == "mesh":
             path = folder / f"{name}.ply"
-            smooth = _write_ply(path, value["mesh"], value["to_world"])
+            _write_ply(mi, path, value["mesh"], value["to_world"])
             rest = {key: item for key, item in value.items() if key not in ("type", "mesh", "to_world")}
-            value = {"type": "ply", "filename": str(path), "face_normals": not smooth, **rest}
+            value = {"type": "ply", "filename": str(path), "face_normals": value["mesh"].normals is None, **rest}
         return {key: _to_mitsuba(mi, item, folder, key) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         if value.shape == (4, 4):
@@ -164,23 +164,20 @@ def _to_mitsuba(mi: Any, value: Any, folder: Path, name: str = "") -> Any:
     return value
 
 
-def _write_ply(path: Path, mesh: Mesh, to_world: Array) -> bool:
-    """Write a mesh in its place; returns whether it has normals."""
-    columns: list[NDArray[Any]] = [mesh.vertices @ to_world[:3, :3].T + to_world[:3, 3]]
-    names = ["x", "y", "z"]
-    if mesh.normals is not None:
-        normals = mesh.normals @ np.linalg.inv(to_world[:3, :3])
-        columns.append(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9))
-        names += ["nx", "ny", "nz"]
+def _write_ply(mi: Any, path: Path, mesh: Mesh, to_world: Array) -> None:
+    """Write a mesh in its place."""
     # Mitsuba's images begin at the top.
     uv = np.zeros((len(mesh.vertices), 2)) if mesh.uv is None else mesh.uv * (1, -1) + (0, 1)
-    columns.append(uv)
-    names += ["u", "v"]
-    vertices = np.concatenate(columns, axis=1).astype("<f4")
-    faces = np.empty(len(mesh.faces), [("n", "u1"), ("i", "<i4", 3)])
-    faces["n"], faces["i"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
-    return mesh.normals is not None
+    positions = mesh.vertices @ to_world[:3, :3].T + to_world[:3, 3]
+    columns: dict[str, NDArray[Any]] = {"vertex_positions": positions, "vertex_texcoords": uv}
+    if mesh.normals is not None:
+        normals = mesh.normals @ np.linalg.inv(to_world[:3, :3])
+        columns["vertex_normals"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    has = {"has_vertex_normals": mesh.normals is not None, "has_vertex_texcoords": True}
+    written = mi.Mesh(path.stem, len(positions), len(mesh.faces), **has)
+    parameters = mi.traverse(written)
+    parameters["faces"] = mesh.faces.astype(np.uint32).ravel()
+    for name, values in columns.items():
+        parameters[name] = values.astype(np.float32).ravel()
+    parameters.update()
+    written.write_ply(str(path))
