@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -65,14 +66,11 @@ class Stock:
         found = self._things(lambda model: model.category in _OUTDOORS and model.elevation < 0.1)
         return [model for model in found if max(model.size) < 9]
 
-    def normal_map(self, rng: Rng) -> Array | None:
-        """A normal map, ``(H, W, 3)``."""
-        paths = self.assets.normals
-        if not paths:
-            return None
+    def image(self, rng: Rng, paths: Sequence[Path]) -> Path:
+        """One of these skies or normal maps."""
         path = paths[int(rng.integers(len(paths)))]
         self.credits.add(self.assets.credit(path))
-        return read_normal_map(path).astype(np.float64)
+        return path
 
 
 def theme(rng: Rng) -> str:
@@ -147,11 +145,11 @@ def _bsdf(rng: Rng, surface: Surface) -> Bsdf:
 
 def bumpy(rng: Rng, stock: Stock, bsdf: Bsdf, repeat: float) -> Bsdf:
     """A one-layer material with a normal map over it, if there is one."""
-    image = stock.normal_map(rng)
-    if image is None or bsdf["type"] != "twosided":
+    path = stock.image(rng, stock.assets.normals) if stock.assets.normals else None
+    if path is None or bsdf["type"] != "twosided":
         return bsdf
-    inner = {"type": "normalmap", "normalmap": _raw(image, repeat), "bsdf": bsdf["bsdf"]}
-    return {"type": "twosided", "bsdf": inner}
+    normals = _raw(read_normal_map(path).astype(np.float64), repeat)
+    return {"type": "twosided", "bsdf": {"type": "normalmap", "normalmap": normals, "bsdf": bsdf["bsdf"]}}
 
 
 def _raw(image: Array, repeat: float = 1.0) -> Bsdf:

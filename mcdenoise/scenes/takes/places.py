@@ -85,9 +85,7 @@ def any_sky(rng: Rng, stock: Stock, level: float, sun: Array | None, ratio: floa
     """A photographed sky of that mean radiance, or a painted one."""
     if not stock.assets.skies or rng.random() < 0.4:
         return sky(rng, level, sun, ratio)
-    path = stock.assets.skies[int(rng.integers(len(stock.assets.skies)))]
-    stock.credits.add(stock.assets.credit(path))
-    image = read_sky(path).astype(np.float64)
+    image = read_sky(stock.image(rng, stock.assets.skies)).astype(np.float64)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
     rows = np.sin((np.arange(len(image)) + 0.5) / len(image) * math.pi)[:, None, None]
     return np.asarray(image * level / max(float((image * rows).mean() / rows.mean()), 1e-6))
