@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -151,8 +152,7 @@ def rgb(color: Color) -> dict[str, Any]:
 
 def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
     """Lower and upper corner of a transformed shape's axis-aligned bounding box."""
-    ends = np.array(_BOUNDS[kind], dtype=np.float64)
-    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array([*product(*zip(*_BOUNDS[kind], strict=True))], dtype=np.float64)
     world = corners @ matrix[:3, :3].T + matrix[:3, 3]
     return world.min(axis=0), world.max(axis=0)
 

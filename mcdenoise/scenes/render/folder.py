@@ -13,7 +13,6 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Array, Camera, view_projection
-from mcdenoise.data.exr import read_exr
 from mcdenoise.data.files import make_folder, write_json
 from mcdenoise.data.images import read_image_header
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
@@ -232,15 +231,6 @@ def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceSt
     noise = {} if state.noise is None else {"reference_noise": state.noise}
     header = {"reference_spp": state.spp, "reference_passes": state.passes, **noise}
     write_buffer(folder, number, "reference", image, metadata=header)
-
-
-def read_reference(folder: Path, number: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Read the ``(H*W, 3)`` pixels of ``referenceN.exr``.
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    return read_exr(folder / f"reference{number}.exr")[0].astype(np.float64).reshape(-1, 3)
 
 
 def write_noisy(folder: Path, number: int, noise_seed: int, buffers: Mapping[str, Tensor]) -> None:

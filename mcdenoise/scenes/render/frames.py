@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.data.exr import read_exr
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.files import as_tensor
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import ReferenceState, read_reference, write_noisy, write_reference
+from mcdenoise.scenes.render.folder import ReferenceState, write_noisy, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.scenes.render.loading import Scene
 from mcdenoise.scenes.render.stage import Stage
@@ -182,7 +183,9 @@ def _refine_reference(
         halves = ReferenceHalves.load(unfinished, job.size)
         advance(halves.spp - before.spp)
     else:
-        mean = read_reference(job.folder, number) if before.spp else np.zeros((job.size[0] * job.size[1], 3))
+        mean = np.zeros((job.size[0] * job.size[1], 3))
+        if before.spp:
+            mean += read_exr(job.folder / f"reference{number}.exr")[0].reshape(mean.shape)
         halves = ReferenceHalves.start(mean, before.spp, before.passes)
     saved = time.monotonic()
     while not job.is_good(halves.spp, _reliable_noise(halves)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,9 @@ class Stage:
         shapes = {shape.id(): shape for shape in self.scene.shapes()}
         self._at_rest = {identity: self._placement(identity, shapes) for identity in self.moves}
         self.movers = [identity for identity in self.moves if identity in shapes]
-        self._boxes = {identity: _box(shapes[identity]) for identity in self.movers}
+        # Corners of the bounding boxes.
+        boxes = {identity: shapes[identity].bbox() for identity in self.movers}
+        self._boxes = {name: np.array([*product(*zip(box.min, box.max, strict=True))]) for name, box in boxes.items()}
 
     def place(self, frame: int) -> None:
         """Put every moving object to its place in a frame.
@@ -114,13 +117,6 @@ class Stage:
 def to_previous(path: Array, frame: int) -> Array:
     """``(4, 4)``, from where an object is in a frame to where it was in the previous one; the identity at first."""
     return np.asarray(path[max(frame - 1, 0)] @ np.linalg.inv(path[frame]))
-
-
-def _box(shape: Any) -> Array:
-    """Corners ``(8, 3)`` of a shape's bounding box."""
-    box = shape.bbox()
-    ends = np.array([box.min, box.max], dtype=np.float64)
-    return np.array([[ends[x, 0], ends[y, 1], ends[z, 2]] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 def _transformed(key: str, value: Array, matrix: Array) -> tuple[Any, ...]:
