@@ -264,10 +264,7 @@ def furnish(builder: SceneBuilder, rng: Rng) -> None:
 def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, float, float]]) -> None:
     """Find a free place for a piece of furniture, usually along the walls, and put objects on it.
 
-    Args:
-        builder: collects the objects.
-        rng: the source of randomness.
-        taken: x, z and radius of existing pieces; the new one is added.
+    ``taken`` has x, z and radius of existing pieces; the new one is added.
     """
     low, high = builder.low, builder.high
     parts, radius, top = furniture(builder, rng, float(high[1]))
