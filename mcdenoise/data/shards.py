@@ -93,12 +93,13 @@ def write_shard(path: Path, header: Mapping[str, Any], arrays: Mapping[str, NDAr
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as files:
         shapes = {name: list(array.shape) for name, array in arrays.items()}
         about = {**header, "format": _FORMAT, "shapes": shapes}
-        files.writestr(_entry("header.json"), json.dumps(about, indent=1))
+        # The time of such an entry is always that of 1980: the same content is the same file.
+        files.writestr(zipfile.ZipInfo("header.json"), json.dumps(about, indent=1))
         for name, array in arrays.items():
             finite = np.where(np.isinf(array), array, np.clip(array, -limit, limit))
             planes = np.ascontiguousarray(finite, dtype="<f2").view(np.uint8).reshape(-1, 2)
             for plane in (1, 0):
-                entry = _entry(f"{name}.{plane}.npy")
+                entry = zipfile.ZipInfo(f"{name}.{plane}.npy")
                 content = io.BytesIO()
                 np.save(content, np.ascontiguousarray(planes[:, plane]), allow_pickle=False)
                 files.writestr(entry, content.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=4)
@@ -150,11 +151,6 @@ def _joined(files: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> Halves
                 raise ValueError(f"{name} of another length")
             values[:, plane] = found
     return values.view("<f2").reshape(shape).astype(np.float16, copy=False)
-
-
-def _entry(name: str) -> zipfile.ZipInfo:
-    # The same content is the same file: no time of writing.
-    return zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
 
 
 @contextmanager
