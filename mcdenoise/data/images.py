@@ -306,13 +306,6 @@ def check_name(path: Path) -> None:
         raise InputError(f"{path}: expected a name in UTF-8, found other bytes; rename the file")
 
 
-def _is_hollow(path: Path, spec: oiio.ImageSpec, promised: int) -> bool:
-    """Whether a header declares more pixels than its file can hold, whatever the compression."""
-    dwa = str(spec.getattribute("compression")).startswith("dwa")
-    ratio = _LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO
-    return promised > ratio * os.path.getsize(path)
-
-
 def _picture_metadata(spec: oiio.ImageSpec) -> Metadata:
     """The attributes that describe the picture rather than its storage."""
     kept: Metadata = {}
@@ -365,8 +358,9 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         if min(spec.width, spec.height) < 1 or pixels > LARGEST_PIXEL_COUNT or spec.depth > 1:
             raise _refused(path, f"{spec.width} x {spec.height} pixels")
         bytes_promised += pixels * int(spec.pixel_bytes(True))
-        # Checked before memory is allocated.
-        if _is_hollow(path, spec, bytes_promised):
+        # More than the file can hold, whatever the compression; checked before memory is allocated.
+        dwa = str(spec.getattribute("compression")).startswith("dwa")
+        if bytes_promised > (_LARGEST_DWA_RATIO if dwa else _LARGEST_RATIO) * os.path.getsize(path):
             raise _refused(
                 path, f"{spec.width} x {spec.height} pixels of {spec.nchannels} channels, but not their data"
             )

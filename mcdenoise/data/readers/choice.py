@@ -216,7 +216,10 @@ def _rank_by_points(choice: Choice, buffer: str, image: Image, read: Read) -> in
     """0 for positions that a camera sees at their pixels and a depth along its axis, 1 for a distance, 2 for others."""
     if buffer != "position" and (buffer != "depth" or "position" not in choice.layers):
         return 2
-    position = (image if buffer == "position" else _whole(choice.layers["position"], read))[..., :3]
+    position = image[..., :3]
+    if buffer == "depth":
+        layer = choice.layers["position"]
+        position = read([layer], _ALL)[layer][..., :3]
     if position.shape[:2] != image.shape[:2]:
         return 2
     hit = np.isfinite(position).all(-1) & (position != 0).any(-1)
@@ -239,10 +242,6 @@ def _twins(color: Layer, unnamed: Sequence[Layer], read: Read) -> list[Layer]:
         pixels = {layer: image[..., :3] for layer, image in (read([color, *others], rows) if others else {}).items()}
         others = [each for each in others if np.array_equal(pixels[each], pixels[color], equal_nan=True)]
     return others
-
-
-def _whole(layer: Layer, read: Read) -> Image:
-    return read([layer], _ALL)[layer]
 
 
 def _conversions(color: Layer, unnamed: Sequence[Layer], read: Read) -> dict[Layer, Array]:

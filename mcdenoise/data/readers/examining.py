@@ -172,12 +172,7 @@ def _ends_at_origin(shot: RenderedFiles) -> bool:
 
 
 def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention, str]:
-    """Determine the convention of the motion by comparing consecutive frames; motion that is all zero is removed.
-
-    Args:
-        shot: the files.
-        first: all images of its first frame.
-    """
+    """Determine the convention of the motion by comparing consecutive frames; motion that is all zero is removed."""
     layer = shot.choice.layers["motion"]
     given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
     kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
