@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -17,7 +18,11 @@ _NOISE_EPSILON = 0.01
 
 def reference_noise(sequence: Sequence) -> float | None:
     """Mean noise of the references, as recorded by the renderer, see :func:`recorded_noise`; ``None`` if it is not."""
-    noise = recorded_noise(sequence)
+    return mean_noise(recorded_noise(sequence))
+
+
+def mean_noise(noise: Mapping[int, float]) -> float | None:
+    """The mean over the frames, ``None`` for none."""
     return sum(noise.values()) / len(noise) if noise else None
 
 
