@@ -23,6 +23,7 @@ from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._op import backends_of
+from mcdenoise.ops._window import parts_of
 from mcdenoise.results import OpCost, OpResults, Spread
 
 # Far larger than any cache, so that the copy shows the memory's speed.
@@ -203,10 +204,8 @@ def largest_case(op: Op) -> Case:
         in_rgb = any(tensor.ndim == 4 and tensor.shape[1] == 3 for tensor in tensors)
         return in_rgb, sum(tensor.numel() for tensor in tensors) / (height * width)
 
-    def is_one_image(case: Case) -> bool:
-        return max(_size(case)) > 1 and all(tensor.shape[0] == 1 for tensor in tensors_in(case.inputs()))
-
-    return max((case for case in op.cases if case.kind == "ordinary" and is_one_image(case)), key=size)
+    images = (case for case in op.cases if case.kind == "ordinary" and max(_size(case)) > 1)
+    return max((case for case in images if all(len(tensor) == 1 for tensor in tensors_in(case.inputs()))), key=size)
 
 
 def enlarged(
@@ -216,26 +215,18 @@ def enlarged(
 
     A grid of cells, which has five axes, gets as many of them as the size takes.
     """
-    old_height, old_width = _size(case)
+    whole = _size(case)
 
     def repeat(tensor: Tensor) -> Tensor:
-        if tensor.ndim == 5:
-            rows, columns = (-(-side // case.settings["cell"]) for side in (height, width))
-            times = -(-rows // tensor.shape[2]), -(-columns // tensor.shape[3])
-            return tensor.to(device).repeat(1, 1, *times, 1)[:, :, :rows, :columns].contiguous()
-        if tensor.ndim != 4:
+        if tensor.ndim < 4:
             return tensor.to(device)
-        whole = tuple(tensor.shape[-2:]) == (old_height, old_width)
-        rows, columns = (height, width) if whole else (_half(height), _half(width))
-        times = -(-rows // tensor.shape[-2]), -(-columns // tensor.shape[-1])
-        return tensor.to(device).repeat(1, 1, *times)[..., :rows, :columns].contiguous()
+        cell = case.settings["cell"] if tensor.ndim == 5 else 1 if tuple(tensor.shape[2:]) == whole else 2
+        rows, columns = (parts_of(side, cell) for side in (height, width))
+        times = parts_of(rows, tensor.shape[2]), parts_of(columns, tensor.shape[3]), *(1,) * (tensor.ndim - 4)
+        return tensor.to(device).repeat(1, 1, *times)[:, :, :rows, :columns].contiguous()
 
     settings = case.settings | ({"size": (height, width)} if "size" in case.settings else {})
     return map_tensors(repeat, case.inputs(dtype)), settings
-
-
-def _half(side: int) -> int:
-    return (side + 1) // 2
 
 
 def _size(case: Case) -> tuple[int, int]:
