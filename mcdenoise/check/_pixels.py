@@ -13,14 +13,13 @@ from torch import Generator, Tensor
 
 from mcdenoise import ops
 from mcdenoise.check.case import Draw, Op, between, constant, dim, normal, numbers, powers, radiance, times, uniform
-from mcdenoise.check.regimes import IMAGE, IMAGES, SMALL, Argument, Size, checked, extreme, half, ordinary, stiff
+from mcdenoise.check.regimes import HALF, IMAGE, IMAGES, SMALL, Argument, Size, checked, extreme, ordinary, stiff
 from mcdenoise.ops._window import parts_of
 
-_HALF = replace(IMAGE, axes=half)
 _POSITIVE = {name: draw for name, draw in IMAGES.items() if "signs" not in name}
 _FUSION = checked(
     ops.laplacian_fusion,
-    {"fine": IMAGE, "coarse": _HALF, "alpha": Argument(uniform, 1, numbers(0, 1))},
+    {"fine": IMAGE, "coarse": HALF, "alpha": Argument(uniform, 1, numbers(0, 1))},
     ordinary("an alpha for each channel", (1, 3, 3, 2), alpha=3),
 )
 
@@ -238,7 +237,7 @@ _REGRESSION = checked(
 
 OPS = (
     checked(ops.downsample, {"image": IMAGE}),
-    checked(ops.upsample, {"image": _HALF}),
+    checked(ops.upsample, {"image": HALF}),
     _FUSION,
     _demodulation(ops.demodulate, "color"),
     _demodulation(ops.remodulate, "image"),

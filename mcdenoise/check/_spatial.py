@@ -26,7 +26,7 @@ from mcdenoise.check.case import (
     times,
     uniform,
 )
-from mcdenoise.check.regimes import IMAGE, SMALL, Argument, checked, extreme, half, ordinary, stiff
+from mcdenoise.check.regimes import HALF, IMAGE, SMALL, Argument, checked, extreme, half, ordinary, stiff
 from mcdenoise.ops._window import inside, offsets, pad, shifted
 
 _LOGITS = {"to +-1e4": times(1e4, normal), "of 1e4": times(1, normal, 1e4), "of both signs": alternating(1e4)}
@@ -193,7 +193,6 @@ _AFFINITY = checked(
     fireflies=stiff("fireflies", (1, 1, 2, 2), dim, kernel_size=3, only=_FRAME),
     rounds=_lost,
 )
-_HALF = replace(IMAGE, axes=half)
 
 OPS = (
     _filter(ops.kernel_conv),
@@ -211,7 +210,7 @@ OPS = (
     checked(
         ops.learned_upsample,
         {
-            "image": _HALF,
+            "image": HALF,
             "kernel": Argument(softmax(1, 4), 16, {"0": constant(0), "that cancel": alternating(1e4)}, half),
         },
         extreme("8x8 taps on 1x2", (1, 3, 1, 3), kernel=64, border="replicate"),

@@ -108,6 +108,10 @@ def half(size: Size, settings: Mapping[str, Any]) -> tuple[int, ...]:
     return (size[2] + 1) // 2, (size[3] + 1) // 2
 
 
+# An image of half the size.
+HALF = replace(IMAGE, axes=half)
+
+
 def _rows(kind: Kind, size: Size, image: Draw, smooth: tuple[str, ...] | None) -> Callable[..., Row]:
     def row(
         name: str,

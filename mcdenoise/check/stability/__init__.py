@@ -9,7 +9,6 @@ from functools import partial
 import torch
 
 from mcdenoise.check.own import find_ops, note_of
-from mcdenoise.check.stability import _denoiser, _long_runs, _models, _ops
 from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check
 from mcdenoise.check.stability._denoiser import VALID_SHOT, check_denoiser
 from mcdenoise.check.stability._long_runs import FRAMES, long_runs
@@ -75,10 +74,10 @@ def groups(
     chosen_ops = find_ops(ops) if everything or ops is not None else []
     chosen_models = _available(models) if everything or models is not None else []
     return [
-        *(Group(op.name, partial(_ops.check_op, op, dtypes), note_of(op)) for op in chosen_ops),
-        *(Group(name, partial(_models.check_model, name, dtypes)) for name in chosen_models),
-        *(Group(f"Denoiser, {name}", partial(_denoiser.check_denoiser, name, dtypes)) for name in chosen_models),
-        *([Group(LONG_RUNS, partial(_long_runs.long_runs, dtypes, frames))] if everything else []),
+        *(Group(op.name, partial(check_op, op, dtypes), note_of(op)) for op in chosen_ops),
+        *(Group(name, partial(check_model, name, dtypes)) for name in chosen_models),
+        *(Group(f"Denoiser, {name}", partial(check_denoiser, name, dtypes)) for name in chosen_models),
+        *([Group(LONG_RUNS, partial(long_runs, dtypes, frames))] if everything else []),
     ]
 
 
