@@ -183,7 +183,6 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
     # A method that returns its input has no run time to show on a logarithmic axis.
     if milliseconds and not cell.stages.keys() - set(FILE_STAGES):
         milliseconds = Range(0.0, 0.0, 0.0)
-    size = next((one.width * one.height for one in results.scenes if one.name == scene), 0)
     return Row(
         method,
         number,
@@ -194,7 +193,7 @@ def _row(results: Results, number: int, method: Method, scene: str) -> Row:
         milliseconds,
         None if cell.whole is None else _range(cell.whole),
         {stage: _range(cell.stages[stage]) for stage in STAGES if stage in cell.stages},
-        size / milliseconds.value / 1e3 if milliseconds and milliseconds.value > 0 else None,
+        results.megapixels_per_second(cell) if milliseconds and milliseconds.value > 0 else None,
         cell.memory,
     )
 
