@@ -216,10 +216,7 @@ def coat(name: str, color: Color) -> Any:
 
 def lamp(strength: float, color: Color) -> Any:
     """An emissive material."""
-    material, _, shader = surface("Lamp")
-    shader.inputs["Emission Color"].default_value = (*color, 1)
-    shader.inputs["Emission Strength"].default_value = strength
-    return material
+    return surface("Lamp", Emission_Color=(*color, 1), Emission_Strength=strength)[0]
 
 
 def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale: float, **inputs: Any) -> Any:
@@ -238,10 +235,10 @@ def patterned(name: str, kind: str, low: Color, high: Color, output: str, scale:
 
 def planks() -> Any:
     """Lacquered dark wood with a strong grain."""
+    lacquer = {"Roughness": 0.5, "Coat_Weight": 1.0, "Coat_Roughness": 0.05}
     material, node, _ = patterned(
-        "Planks", "ShaderNodeTexWave", (0.02, 0.01, 0.006), (0.2, 0.1, 0.05), "Fac", 9.0, Roughness=0.5, Coat_Weight=1.0
+        "Planks", "ShaderNodeTexWave", (0.02, 0.01, 0.006), (0.2, 0.1, 0.05), "Fac", 9.0, **lacquer
     )
-    material.node_tree.nodes["Principled BSDF"].inputs["Coat Roughness"].default_value = 0.05
     node.inputs["Distortion"].default_value, node.inputs["Detail"].default_value = 6.0, 6.0
     return material
 

@@ -24,6 +24,11 @@ from mcdenoise.scenes.takes.draw import draw_take
 from mcdenoise.suite.rows import SHOTS, Row, Shot
 
 _SCRIPT = Path(__file__).with_name("blender_scenes.py")
+# Names of the files of a frame and of its reference, by renderer.
+_FILES = {
+    "mitsuba": ("inputs/color{}.exr", "inputs/reference{}.exr"),
+    "cycles": ("shot_{:04d}.exr", "reference_{:04d}.exr"),
+}
 # Each reference is the mean of this many renderings; the difference of its two halves estimates its noise.
 _PARTS = 8
 # All references get a quarter of their samples before any gets the rest, so that the suite can be used early.
@@ -85,14 +90,9 @@ def open_row(row: Row, data: Path) -> Sequence:
 
 
 def _is_there(shot: Shot, data: Path) -> bool:
-    frames, references = range(shot.frames), shot.references
-    if shot.renderer == "mitsuba":
-        folder = data / shot.name / "inputs"
-        names = [f"color{n}.exr" for n in frames] + [f"reference{n}.exr" for n in references]
-    else:
-        folder = data / shot.name
-        names = [_shot_file(n) for n in frames] + [_reference_file(n) for n in references]
-    return all((folder / name).is_file() for name in names)
+    frame, reference = _FILES[shot.renderer]
+    names = [*map(frame.format, range(shot.frames)), *map(reference.format, shot.references)]
+    return all((data / shot.name / name).is_file() for name in names)
 
 
 def _is_whole(shot: Shot, data: Path) -> bool:
@@ -139,10 +139,9 @@ def _take_references(shot: Shot, data: Path) -> None:
     first = _first(shot)
     if first == shot:
         return
-    for number in shot.references:
-        source = data / first.name / "inputs" / f"reference{number}.exr"
+    for name in map(_FILES["mitsuba"][1].format, shot.references):
+        source, target = data / first.name / name, data / shot.name / name
         if source.is_file():
-            target = data / shot.name / "inputs" / source.name
             make_folder(target.parent)
             with atomic_path(target) as unfinished:
                 shutil.copyfile(source, unfinished)
@@ -152,7 +151,8 @@ def _render_cycles(shot: Shot, data: Path, fraction: float, blender: Blender | N
     folder, parts = data / shot.name, _parts_of(shot, data)
     for each in (folder, parts):
         make_folder(each)
-    noisy = {folder / _shot_file(n): (n, shot.samples, _SEED + n) for n in range(shot.frames)}
+    frame, reference = _FILES["cycles"]
+    noisy = {folder / frame.format(n): (n, shot.samples, _SEED + n) for n in range(shot.frames)}
     samples = max(shot.reference_samples // _PARTS, 1)
     clean = {
         _part(parts, part, n): (n, samples, _REFERENCE_SEED + 1000 * part + n)
@@ -164,7 +164,7 @@ def _render_cycles(shot: Shot, data: Path, fraction: float, blender: Blender | N
     noise = {}
     for n in shot.references:
         found = [path for k in range(_PARTS) if (path := _part(parts, k, n)).is_file()]
-        noise[str(n)] = _write_reference(folder / _reference_file(n), found, samples)
+        noise[str(n)] = _write_reference(folder / reference.format(n), found, samples)
     write_json(folder / "camera.json", {"reference_noise": noise})
 
 
@@ -213,11 +213,3 @@ def _first(shot: Shot) -> Shot:
 
 def _part(folder: Path, part: int, frame: int) -> Path:
     return folder / f"part{part}_{frame:04d}.exr"
-
-
-def _shot_file(frame: int) -> str:
-    return f"shot_{frame:04d}.exr"
-
-
-def _reference_file(frame: int) -> str:
-    return f"reference_{frame:04d}.exr"
