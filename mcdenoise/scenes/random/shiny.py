@@ -74,19 +74,13 @@ def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
     """A place on one of the four sides, with +z inwards, and the width and height of that side."""
     low, high = builder.low, builder.high
     wall = int(rng.integers(4))
-    width = float((high - low)[0 if wall % 2 == 0 else 2])
-    height = float(high[1])
-    along = rng.uniform(-0.35, 0.35)
-    middle = (low + high) / 2
-    x, z = middle[0], middle[2]
-    if wall % 2 == 0:
-        x += along * width
-        z = low[2] if wall == 0 else high[2]
-    else:
-        z += along * width
-        x = low[0] if wall == 1 else high[0]
-    y = rng.uniform(0.4, 0.6) * height
-    return place((float(x), float(y), float(z)), (0, 90, 180, -90)[wall]), width, height
+    along, across = (2, 0) if wall % 2 else (0, 2)
+    width, height = float((high - low)[along]), float(high[1])
+    where = (low + high) / 2
+    where[along] += rng.uniform(-0.35, 0.35) * width
+    where[across] = (low if wall < 2 else high)[across]
+    where[1] = rng.uniform(0.4, 0.6) * height
+    return place(where, (0, 90, 180, -90)[wall]), width, height
 
 
 def _wall_mirror(builder: SceneBuilder, rng: Rng) -> Array:
