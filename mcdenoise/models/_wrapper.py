@@ -52,20 +52,6 @@ class Wrapper(nn.Module):
         return self.inner(frame, state)
 
 
-def run(model: Model, handed: list[Frame], state: State) -> tuple[Output, State]:
-    """Call a model with a frame that has no other reference, so that the model can free its memory early.
-
-    Args:
-        model: any.
-        handed: list that holds the frame; empty afterwards.
-        state: see :class:`mcdenoise.models.Model`.
-    """
-    # ``nn.Module.__call__`` keeps references to its arguments until it returns.
-    step = model.forward if isinstance(model, nn.Module) else model
-    found: tuple[Output, State] = step(handed.pop(), state)
-    return found
-
-
 def name_of(model: Model) -> str:
     """The name of the class or function that is inside all wrappers of a model."""
     inner: Any = model

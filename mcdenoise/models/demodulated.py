@@ -7,12 +7,12 @@ from functools import partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, scale_samples
 from mcdenoise.models._interface import Note, Output, State
 from mcdenoise.models._reads import at_hand
-from mcdenoise.models._wrapper import Wrapper, run
+from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._rows import by_rows
 from mcdenoise.ops.demodulation import modulation
@@ -44,10 +44,11 @@ class Demodulated(Wrapper):
         if albedo is None or reason:
             output, state = self.inner(frame, state)
             return output.noted(note), state
-        handed = [_without_albedo(frame)]
-        wanted = frame.hints.stages
+        handed, wanted = [_without_albedo(frame)], frame.hints.stages
+        # The method can free the images that it no longer needs: ``nn.Module.__call__`` would keep its arguments.
         del frame
-        output, state = run(self.inner, handed, state)
+        step = self.inner.forward if isinstance(self.inner, nn.Module) else self.inner
+        output, state = step(handed.pop(), state)
         # A network that ends with a convolution returns half precision under autocast.
         return output.lit(partial(remodulated, albedo), stages=wanted).noted(note), state
 
