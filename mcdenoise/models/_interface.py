@@ -62,11 +62,7 @@ class Output(NamedTuple):
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Output:
         """The same with a function of every image."""
-        stages, layers = (
-            {name: function(image) for name, image in each.items()} for each in (self.stages, self.layers)
-        )
-        alpha = None if self.alpha is None else function(self.alpha)
-        return Output(function(self.image), stages, layers, alpha, self.notes)
+        return self.lit(function)._replace(alpha=None if self.alpha is None else function(self.alpha))
 
     def lit(self, function: Callable[[Tensor], Tensor], *, stages: bool = True) -> Output:
         """The same with a function of all light: of the image, the layers, and the stages unless they are dropped."""
