@@ -9,10 +9,12 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame, tells_motion
 from mcdenoise.models._interface import Note, State
-from mcdenoise.models._motion import comparable, has_motion, motion_unless_still, surface_before
+from mcdenoise.models._motion import comparable, motion_unless_still, surface_before
 from mcdenoise.models._state import own_state
 from mcdenoise.ops import Surface, reproject, resample
 
+# Why a frame has no history where it does not tell what its pixels were before.
+NO_MOTION = "no motion, and no position with a previous camera"
 _ROUNDED = 8  # largest rounding error of the weight of all four taps, which is 1, in units of eps
 
 
@@ -63,10 +65,11 @@ def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None)
         view_projection: camera of the frame before.
     """
     if image is None:
-        return "first frame" if tells_motion(frame.buffers) else "no motion"
+        return "first frame" if tells_motion(frame.buffers) else NO_MOTION
     if image.shape[2:] != frame.color.shape[2:]:
         return "size change"
-    return "" if has_motion(frame, view_projection) else "no motion"
+    told = frame.motion is not None or (tells_motion(frame.buffers) and view_projection is not None)
+    return "" if told else NO_MOTION
 
 
 def reprojected(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mcdenoise.frame import Frame, tells_motion
+from mcdenoise.frame import Frame
 from mcdenoise.models._reads import at_hand
 from mcdenoise.ops import Surface, motion_from_position
 
@@ -33,11 +33,6 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     if position is None or previous_view_projection is None:
         return None
     return motion_from_position(position, previous_view_projection)
-
-
-def has_motion(frame: Frame, previous_view_projection: Tensor | None) -> bool:
-    """Whether a frame tells where its pixels were in the frame before, without computing it."""
-    return tells_motion(frame.buffers) and (frame.motion is not None or previous_view_projection is not None)
 
 
 def motion_unless_still(

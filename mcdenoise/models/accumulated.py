@@ -13,6 +13,7 @@ from torch.utils import _pytree as pytree
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, with_light
+from mcdenoise.models._history import NO_MOTION, reset_of
 from mcdenoise.models._interface import GUIDES, Model, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
 from mcdenoise.models._motion import comparable, is_still, motion_unless_still, surface_before
@@ -44,8 +45,6 @@ SPECULAR_LENGTH = 2.0
 _LOST, _CAUSTICS = 0.1, 120.0
 # A light is steady if its compressed radiance varied by less than this fraction over the history.
 _STEADY = 0.1
-_NO_WAY = "no motion, and no position with a previous camera"
-
 
 _Carried: TypeAlias = tuple[Tensor | None, ...]
 
@@ -229,7 +228,7 @@ class Accumulated(Wrapper):
             inner = None
         elif (cut := found.cut) is not None:
             inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
-        light, passing = self._lasting(frame, None if found.reset not in ("", _NO_WAY) else history, found)
+        light, passing = self._lasting(frame, None if found.reset not in ("", NO_MOTION) else history, found)
         still = found.still is True
         notes = [*self._notes(frame, still=still, keeps=keeps), found.note]
         after = found.history(frame, light) if keeps else None
@@ -251,12 +250,12 @@ class Accumulated(Wrapper):
 
     def _reset(self, frame: Frame, history: History | None) -> str:
         """Why the frame cannot have this history; empty if it can, unless there is a cut."""
-        can_move = tells_motion(frame.buffers)
-        reset = "" if history is None else _misfit(history, frame) or self._other_buffers(history, frame)
         surfaces = (frame, frame if history is None else history.surface)
         if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):
-            reset = reset or "no position and normal, which the rule compares"
-        return reset or (_NO_WAY if not can_move else "first frame" if history is None else "")
+            return "no position and normal, which the rule compares"
+        if history is None:
+            return reset_of(frame, None, None)
+        return reset_of(frame, history.length, history.view_projection) or self._other_buffers(history, frame)
 
     def _blended(self, frame: Frame, history: History | None, reset: str, compared: bool) -> _Blended:
         """The frame with its history, where it has one and there is no cut."""
@@ -428,13 +427,6 @@ class Accumulated(Wrapper):
             Note("reproject", why or source, float(why != "")),
             Note("remember", "for the next frame" if keeps else alone or "last frame", float(not keeps)),
         ]
-
-
-def _misfit(history: History, frame: Frame) -> str:
-    """Why a history cannot be that of a frame; empty if it can."""
-    if history.length.shape != frame.color[:, :1].shape:
-        return "size change"
-    return _NO_WAY if frame.motion is None and history.view_projection is None else ""
 
 
 def _steady(color: Tensor) -> Tensor:

@@ -108,4 +108,4 @@ def test_a_frame_without_motion_has_no_history() -> None:
     for seed in (0, 1):
         given = frame(seed=seed).replace(motion=None)
         torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
-    assert denoiser.report.reset == "no motion"
+    assert denoiser.report.reset == "no motion, and no position with a previous camera"
