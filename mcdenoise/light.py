@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -164,10 +165,10 @@ def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> Repai
     if parts:
         pairs = zip((color, *layers.values()), (clean, *parts.values()), strict=True)
         changed = torch.stack([torch.ne(before, after) for before, after in pairs]).any(0)
-        total = _sum(parts.values())
+        total = functools.reduce(torch.add, parts.values())
         # What the color has beyond the valid layers is that of the invalid ones.
         bad = {name: (_high(layer) | (layer < 0)).to(clean.dtype) for name, layer in layers.items()}
-        missing = (clean - total).clamp_min(0) / _sum(bad.values()).clamp_min(1)
+        missing = (clean - total).clamp_min(0) / functools.reduce(torch.add, bad.values()).clamp_min(1)
         scale = torch.where(changed & (total > clean), clean / torch.where(total > 0, total, 1), 1)
         parts = {name: (part + missing * bad[name]) * scale for name, part in parts.items()}
     images = [clean, *parts.values()]
@@ -249,11 +250,6 @@ def _share(ratio: float) -> float:
 def _hole(image: Tensor) -> Tensor:
     """``(B, 1, H, W)``: pixels without a value in some channel."""
     return (image.isnan() | (image == -torch.inf)).any(1, keepdim=True)
-
-
-def _sum(images: Iterable[Tensor]) -> Tensor:
-    first, *others = images
-    return sum(others, first)
 
 
 def _high(image: Tensor) -> Tensor:

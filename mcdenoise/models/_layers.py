@@ -8,6 +8,7 @@ changes its sign.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -102,9 +103,9 @@ def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         parts: ``(B, 3, H, W)`` each, by name; negative values count as 0.
     """
     positive = {name: part.to(image.dtype).clamp_min(0) for name, part in parts.items()}
-    total = _sum(positive)
+    total = functools.reduce(torch.add, positive.values())
     means = {name: part.mean((2, 3), keepdim=True) for name, part in positive.items()}
-    all_light = _sum(means)
+    all_light = functools.reduce(torch.add, means.values())
     some, any_light = total > 0, all_light > 0
     total, all_light = torch.where(some, total, 1), torch.where(any_light, all_light, 1)
     equal = len(parts) - (REST in parts)
@@ -162,7 +163,7 @@ def closed(frame: Frame, ask: Ask) -> Frame:
     """
     if not frame.layers:
         return frame
-    total = _sum(frame.layers)
+    total = functools.reduce(torch.add, frame.layers.values())
     excess = (total - frame.color).clamp_min(0).mean() / total.mean().clamp_min(1e-30)
     names = ", ".join(frame.layers)
 
@@ -186,13 +187,6 @@ def closed(frame: Frame, ask: Ask) -> Frame:
 def opened(output: Output) -> Output:
     """The output without :data:`REST`."""
     return output._replace(layers={name: layer for name, layer in output.layers.items() if name != REST})
-
-
-def _sum(parts: Mapping[str, Tensor]) -> Tensor:
-    first, *others = parts.values()
-    for other in others:
-        first = first + other
-    return first
 
 
 def _noted_once(output: Output, note: Note) -> Output:

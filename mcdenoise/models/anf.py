@@ -32,6 +32,8 @@ The authors' loss is SMAPE plus 0.25 times SMAPE of frame differences (``tempora
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor, nn
 
@@ -118,13 +120,10 @@ class Anf(Network):
         albedo, normal, depth = features_of(frame)
         shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
         radiance = samples_of(frame).to(frame.color.dtype)
-        total: Tensor | None = None
-        count = radiance.shape[1]
-        for sample in range(count):
-            light = torch.log1p(radiance[:, sample] * statistics["exposure"])
-            one = self.embedding(torch.cat([light, shared], 1)) / count
-            total = one if total is None else total + one
-        assert total is not None
+        lights = (torch.log1p(sample * statistics["exposure"]) for sample in radiance.unbind(1))
+        # One sample after the other, so that few features are kept at a time.
+        each = (self.embedding(torch.cat([light, shared], 1)) / radiance.shape[1] for light in lights)
+        total: Tensor = functools.reduce(torch.add, each)
         return total
 
 

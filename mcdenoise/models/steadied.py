@@ -7,6 +7,7 @@ are learnt; a network trained for this task on some hundred clips trusted the pr
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 
@@ -100,6 +101,5 @@ def _means(image: Tensor, window: int) -> Tensor:
     for axis in (-1, -2):
         for taps, apart in _SUMS[window]:
             length = image.shape[axis] - (taps - 1) * apart
-            first, *others = (image.narrow(axis, i * apart, length) for i in range(taps))
-            image = sum(others, first)
+            image = functools.reduce(torch.add, [image.narrow(axis, i * apart, length) for i in range(taps)])
     return image / window**2
