@@ -58,17 +58,13 @@ class Antialiased(Wrapper):
         result = torch.where(weight > 0, blended, image)
         after = inner, Past.of(frame, result, surfaces=False)
         stages = {**output.stages, "denoised": output.image}
-        return output._replace(image=_unmapped(result), stages=stages), after
+        return output._replace(image=result**_GAMMA, stages=stages), after
 
 
 def _mapped(image: Tensor) -> Tensor:
     """``x^(1 / 2.2)``, with a finite derivative at 0."""
     least = torch.finfo(image.dtype).tiny
     return torch.where(image > 0, image.clamp_min(least) ** (1 / _GAMMA), 0)
-
-
-def _unmapped(image: Tensor) -> Tensor:
-    return image**_GAMMA
 
 
 def _to_ycocg(image: Tensor) -> Tensor:

@@ -121,17 +121,14 @@ class MrkpNetwork(Network):
         """See :class:`mcdenoise.models.Model`."""
         dtype = accumulator_dtype(frame.color.dtype)
         levels = self.unet(self.input_of(frame, frame.color))
-        *scales, blended = scales_of(with_carried(frame).to(dtype))  # the coarsest scale is not filtered
+        # Means over blocks of 2x2, 4x4 and 8x8 pixels; the coarsest scale is not filtered.
+        image = with_carried(frame).to(dtype)
+        *scales, blended = itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=image)
         for n, level, head in zip(reversed(scales), reversed(levels), reversed(self.heads), strict=True):
             predicted = F.relu(head(level).to(dtype))
             kernel, alpha = predicted.split([self.taps, 1], 1)
             blended = blend_scales(_filter(n, kernel), blended, alpha)
         return answered(frame, blended.clamp_min(0).to(frame.color.dtype)), None
-
-
-def scales_of(image: Tensor) -> list[Tensor]:
-    """The image, and its means over blocks of 2x2, 4x4 and 8x8 pixels."""
-    return list(itertools.accumulate(range(SCALES), lambda x, _: downsample(x), initial=image))
 
 
 def _filter(image: Tensor, kernel: Tensor) -> Tensor:
