@@ -94,20 +94,17 @@ def choose_model(
         raise InputError(
             f"--budget-ms: expected a model that takes at most {budget:g} ms, found at best {choices[0]}; {_TRIED}"
         )
-    if max_error is None:
-        known = _with_errors(affordable, sequence, results, device)
-        return min(known, key=lambda choice: (choice.error or 0.0, -choice.milliseconds))
-    best: Choice | None = None
+    error_of = _errors(sequence, results, device)
+    scored: list[Choice] = []
     for choice in affordable:
-        (scored,) = _with_errors([choice], sequence, results, device)
-        if scored.error is None:
-            continue
-        if scored.error <= max_error:
-            return scored
-        if best is None or best.error is None or scored.error < best.error:
-            best = scored
+        scored.append(replace(choice, error=error_of(choice)))
+        if max_error is not None and scored[-1].error is not None and scored[-1].error <= max_error:
+            return scored[-1]
+    known = [choice for choice in scored if choice.error is not None]
+    if max_error is None:
+        return min(known or scored, key=lambda choice: (choice.error or 0.0, -choice.milliseconds))
     within = "" if budget is None else f" in {budget:g} ms"
-    found = "no error of any" if best is None else f"at best {best}"
+    found = f"at best {min(known, key=lambda choice: choice.error or 0.0)}" if known else "no error of any"
     raise InputError(
         f"--max-error: expected a model with SMAPE of at most {max_error:g}{within}, found {found}; {_TRIED}"
     )
@@ -138,19 +135,15 @@ def _measure(choice: Choice, size: tuple[int, int], device: str) -> float:
     return statistics.median(times[2:])
 
 
-def _with_errors(choices: list[Choice], sequence: Sequence, results: Path | None, device: str) -> list[Choice]:
-    if results is not None:
-        benchmark = Results.read(results)
-        means = {}
-        for choice in choices:
-            cells = [cell for cell in benchmark.cells if cell.method == choice.name and "SMAPE" in cell.errors]
-            if cells:
-                means[choice.name] = statistics.mean(cell.errors["SMAPE"] for cell in cells)
-        scored = [replace(choice, error=means.get(choice.name)) for choice in choices]
-        return [choice for choice in scored if choice.error is not None] or scored
-    if not sequence.reference_numbers:
-        return choices
-    return [replace(choice, error=_error(choice, sequence, device)) for choice in choices]
+def _errors(sequence: Sequence, results: Path | None, device: str) -> Callable[[Choice], float | None]:
+    """What tells the error of a choice; ``None`` if it is unknown."""
+    if results is None:
+        return lambda choice: _error(choice, sequence, device) if sequence.reference_numbers else None
+    found: dict[str, list[float]] = {}
+    for cell in Results.read(results).cells:
+        if "SMAPE" in cell.errors:
+            found.setdefault(cell.method, []).append(cell.errors["SMAPE"])
+    return lambda choice: statistics.mean(found[choice.name]) if choice.name in found else None
 
 
 def _error(choice: Choice, sequence: Sequence, device: str) -> float:
