@@ -64,7 +64,7 @@ class Convention(NamedTuple):
         with np.errstate(invalid="ignore", over="ignore"):
             xy = motion[..., 1::-1] if self.swapped else motion[..., :2]
             scaled: Image = xy * np.array([self.scale_x, self.scale_y], np.float32)
-        return np.where(_is_known(scaled)[..., None], scaled, np.float32(np.inf))
+        return np.where((_is_known(motion) & _is_known(scaled))[..., None], scaled, np.float32(np.inf))
 
     def moves(self, motion: Image, least: float) -> int:
         """The number of pixels that move more than this in x or y, of those with a motion."""
@@ -81,6 +81,7 @@ def _is_known(motion: Image) -> Mask:
 
 
 USUAL_MOTION = Convention(1, 1, "previous - current, y down, pixels")
+_AT_REST = Convention(0, 0, "no motion")
 
 
 def conventions(size: tuple[int, int], motion: Image) -> list[Convention]:
@@ -158,9 +159,7 @@ def _compare(
     pairs: Sequence[Pair], candidates: Sequence[Convention]
 ) -> tuple[Convention, dict[Convention, float], float]:
     """The best convention, the mean :func:`_mismatch` of each, and that of no motion."""
-    *errors, at_rest = (
-        float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in (*candidates, Convention(0, 0, ""))
-    )
+    *errors, at_rest = (float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in (*candidates, _AT_REST))
     found = dict(zip(candidates, errors, strict=True))
     # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
     return min(found, key=lambda each: found[each] / (_BETTER if "half" in each.words else 1)), found, at_rest
@@ -181,16 +180,12 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
     given, candidates = _candidates([motion for motion, _ in pairs], given)
 
     def missed(convention: Convention) -> float:
-        moved = [
-            convention.apply(motion) if convention.scale_x else np.where(_is_known(motion)[..., None], 0, np.inf)
-            for motion, _ in pairs
-        ]
-        away = [np.linalg.norm(m - seen, axis=-1) for m, (_, seen) in zip(moved, pairs, strict=True)]
+        away = [np.linalg.norm(convention.apply(motion) - seen, axis=-1) for motion, seen in pairs]
         return float(np.mean([np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 0 for each in away]))
 
     errors = {each: missed(each) for each in candidates}
     best = min(errors, key=lambda each: errors[each])
-    at_rest = missed(Convention(0, 0, ""))
+    at_rest = missed(_AT_REST)
     if at_rest < _MOVES or errors[best] > _EXACT * at_rest:
         return None
     return best if errors[best] < _BETTER * errors[given] else given
@@ -212,12 +207,11 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
     """
     height, width = motion.shape[:2]
     step = max(1, int(np.sqrt(height * width / _COMPARED)))
-    motion = motion[::step, ::step]
-    moved = convention.apply(motion) if convention.scale_x else np.zeros_like(motion[..., :2])
+    moved = convention.apply(motion[::step, ::step])
     rows, columns = np.mgrid[:height:step, :width:step]
     x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
     y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
-    known = np.isfinite(x) & np.isfinite(y) & _is_known(motion)
+    known = np.isfinite(x) & np.isfinite(y)
     grid = torch.from_numpy(np.stack([np.where(known, x, 0), np.where(known, y, 0)], -1)).float()[None]
     inside = known & (np.abs(x) <= 1) & (np.abs(y) <= 1)
     total = 0.0
