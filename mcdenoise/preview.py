@@ -40,6 +40,9 @@ class Preview:
         exposure: stops, in [-100, 100]: radiance is shown times ``2**exposure``. By default, the typical radiance (see
             :func:`mcdenoise.nn.auto_exposure`) of the first frame that is not black becomes middle grey, 0.18.
 
+    Attributes:
+        written: the files, in the order of their writing.
+
     Raises:
         InputError: a setting is out of its range, or the package is not installed.
 
@@ -64,13 +67,7 @@ class Preview:
         self.video = video
         self.frames_per_second = frames_per_second
         self.exposure = exposure
-        self._pictures: list[Path] = []
-        self._video: Path | None = None
-
-    @property
-    def written(self) -> list[Path]:
-        """The files, in the order of their writing."""
-        return [*self._pictures, *([self._video] if self._video else [])]
+        self.written: list[Path] = []
 
     def add(self, name: str, image: Tensor, metadata: Metadata | None = None) -> None:
         """Write the PNG of the next frame.
@@ -83,7 +80,7 @@ class Preview:
         Raises:
             InputError: the primaries are no colour space, or the file cannot be written.
         """
-        if not self._pictures:
+        if not self.written:
             make_folder(self.folder / "preview")
             if self._video_path.is_file():
                 remove(self._video_path)
@@ -94,7 +91,7 @@ class Preview:
         codes = [display_codes(rows.float() * factor).permute(1, 2, 0).cpu().numpy() for rows in shown.split(_ROWS, 1)]
         path = self.folder / "preview" / f"{name}.png"
         write_png(path, np.concatenate(codes))
-        self._pictures.append(path)
+        self.written.append(path)
 
     def close(self, *, on_frame: Callable[[], None] = lambda: None) -> None:
         """Write the video of the frames, whole or not at all; nothing where there is one frame, or none.
@@ -112,9 +109,9 @@ class Preview:
             on_frame()
             return read_png(path)
 
-        if self.video and len(self._pictures) > 1:
-            write_video(self._video_path, map(picture, self._pictures), self.frames_per_second)
-            self._video = self._video_path
+        if self.video and len(self.written) > 1:
+            write_video(self._video_path, map(picture, self.written), self.frames_per_second)
+            self.written.append(self._video_path)
 
     @property
     def _video_path(self) -> Path:
