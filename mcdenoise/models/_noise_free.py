@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
+from mcdenoise.models._fireflies import light_of
 from mcdenoise.models._reads import at_hand
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.ops._window import corner, up_to_multiple
@@ -37,11 +38,13 @@ def noise_free(frame: Frame) -> Tensor | None:
     """
     kinds = []
     current = frame.color if frame.current is None else frame.current
-    brightness = _combined(torch.add, current.detach())
+    brightness = light_of(current.detach())
     if frame.depth is not None:
         kinds.append(frame.depth == torch.inf)
     if frame.albedo is not None:
-        kinds.append((_combined(torch.maximum, frame.albedo.detach()) < NO_ALBEDO) & (brightness > 0))
+        # A reduction over the channels would take many times as long.
+        brightest = functools.reduce(torch.maximum, frame.albedo.detach().split(1, 1))
+        kinds.append((brightest < NO_ALBEDO) & (brightness > 0))
     if not kinds:
         return None
     known = kinds[0] if len(kinds) == 1 else kinds[0] | kinds[1]
@@ -71,11 +74,6 @@ def noise_free(frame: Frame) -> Tensor | None:
     found = torch.zeros_like(known)
     found[..., band, :] = plain & corner(wide, plain.shape[-2], plain.shape[-1])
     return found
-
-
-def _combined(operator: Callable[[Tensor, Tensor], Tensor], image: Tensor) -> Tensor:
-    """Combine the three channels pairwise; a reduction over this dimension takes many times as long."""
-    return operator(operator(image[:, :1], image[:, 1:2]), image[:, 2:])
 
 
 def _neighbours(image: Tensor, dim: int) -> tuple[Tensor, Tensor]:
