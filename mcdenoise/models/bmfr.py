@@ -46,7 +46,7 @@ from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_publish
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import block_regression
-from mcdenoise.ops._window import parts_of
+from mcdenoise.ops._window import mirrored_places, parts_of
 from mcdenoise.ops.regression import BLOCK
 
 # Offsets of the first block of a frame, (x, y) in pixels for blocks of 32; half a block is subtracted from both.
@@ -138,8 +138,7 @@ def _moved(image: Tensor, starts: Tensor, axis: int) -> Tensor:
     """Shift each image ``(B, C, H, W)`` by its offset and pad it by reflection to whole blocks."""
     size = image.shape[axis]
     places = torch.arange(parts_of(size + BLOCK - 1, BLOCK) * BLOCK, device=image.device)
-    places = (places - starts[:, None]) % (2 * size)
-    return _gathered(image, torch.minimum(places, 2 * size - 1 - places), axis)
+    return _gathered(image, mirrored_places(places - starts[:, None], size), axis)
 
 
 def _moved_back(blocks: Tensor, starts: Tensor, axis: int, size: int) -> Tensor:
