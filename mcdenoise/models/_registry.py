@@ -44,12 +44,6 @@ def troubles() -> list[str]:
     return taken + wrong
 
 
-def is_registered(name: str) -> bool:
-    """Whether a name is that of a registered model, without importing code that a name could point to."""
-    _import_pages()
-    return name in MODELS or name in _offered()[0]
-
-
 def find_model(name: str) -> Entry:
     """The entry of a registered model, of one that an installed package offers, or of a user's own model.
 
