@@ -12,7 +12,6 @@ from functools import partial
 from importlib.metadata import version
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -206,7 +205,40 @@ def write_report(sequence: Sequence, out: Path, denoiser: Denoiser, report: Sequ
         InputError: the file cannot be written.
     """
     report.older = _of_earlier_runs(out, report.files.values())
-    write_json(out / "denoise.json", _as_json(sequence, denoiser, report))
+    content = {
+        "model": report.model,
+        "picked": report.picked,
+        "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
+        "device": str(denoiser.device),
+        "precision": denoiser.precision,
+        "precision_reason": report.precision,
+        "threads": torch.get_num_threads(),
+        "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
+        "read": [row._asdict() for row in sequence.table],
+        "warnings": [*sequence.warnings, *report.warnings],
+        "keep_all": denoiser.keep_all,
+        "tolerance": next((skipping.tolerance for skipping in parts_of(denoiser.model, Skipping)), None),
+        "plan": report.plan,
+        "tiles": report.tiles,
+        "reads_ahead": denoiser.has_room_ahead,
+        "milliseconds": report.milliseconds,
+        "beside": report.beside,
+        "frames": {
+            str(number): {
+                "file": report.files[number].name,
+                "milliseconds": done.milliseconds,
+                "beside": done.beside,
+                "reset": done.reset,
+                "history": done.history,
+                "replaced_pixels": done.replaced_pixels,
+                "negative_light": done.repairs.negative,
+                "light_gained": done.repairs.gained,
+                "missing": done.missing,
+            }
+            for number, done in report.frames.items()
+        },
+    }
+    write_json(out / "denoise.json", content)
 
 
 def denoised_frames(
@@ -338,39 +370,3 @@ def _of_earlier_runs(out: Path, written: Iterable[Path]) -> list[str]:
     own = {path.name for path in written}
     kinds = {_NUMBERS.sub("#", name) for name in own}
     return sorted(name for name in os.listdir(out) if name not in own and _NUMBERS.sub("#", name) in kinds)
-
-
-def _as_json(sequence: Sequence, denoiser: Denoiser, report: SequenceReport) -> dict[str, Any]:
-    return {
-        "model": report.model,
-        "picked": report.picked,
-        "versions": {name: version(name) for name in ("mcdenoise", "torch", "kornia")},
-        "device": str(denoiser.device),
-        "precision": denoiser.precision,
-        "precision_reason": report.precision,
-        "threads": torch.get_num_threads(),
-        "sequence": {"name": sequence.name, "layout": sequence.layout, "size": list(sequence.size)},
-        "read": [row._asdict() for row in sequence.table],
-        "warnings": [*sequence.warnings, *report.warnings],
-        "keep_all": denoiser.keep_all,
-        "tolerance": next((skipping.tolerance for skipping in parts_of(denoiser.model, Skipping)), None),
-        "plan": report.plan,
-        "tiles": report.tiles,
-        "reads_ahead": denoiser.has_room_ahead,
-        "milliseconds": report.milliseconds,
-        "beside": report.beside,
-        "frames": {
-            str(number): {
-                "file": report.files[number].name,
-                "milliseconds": done.milliseconds,
-                "beside": done.beside,
-                "reset": done.reset,
-                "history": done.history,
-                "replaced_pixels": done.replaced_pixels,
-                "negative_light": done.repairs.negative,
-                "light_gained": done.repairs.gained,
-                "missing": done.missing,
-            }
-            for number, done in report.frames.items()
-        },
-    }
