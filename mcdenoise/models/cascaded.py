@@ -26,7 +26,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, published
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
@@ -56,20 +56,11 @@ class _Scales(Network):
         self.needs = Needs(uses=GUIDES, reach=reach, stride=self.unet.multiple, live=self.unet.live)
 
     def fuse(self, images: list[Tensor]) -> Tensor:
-        """Fuse the scales of an image, finest first."""
+        """Fuse the scales of an image, and of what follows its color, finest first."""
         fused = images[-1]
         for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
             fused = fusion(image, fused)  #                                                                     Eq. 2
         return fused
-
-    def fuse_with(self, images: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Fuse the color of each scale, and blend its further channels by weighted means with the same weights."""
-        fused, others = images[-1][:, :3], images[-1][:, 3:]
-        for image, fusion in zip(images[-2::-1], self.fusions, strict=True):
-            fine = image[:, :3]
-            others = fusion.mean(image[:, 3:], others, fusion.weight(fine, fused))
-            fused = fusion(fine, fused)
-        return fused, others
 
 
 class PixelNetwork(_Scales):
@@ -110,21 +101,18 @@ class KernelNetwork(_Scales):
         x, (albedo, normal, depth) = frame.color, self.features(frame)
         levels = self.unet(torch.cat([x, albedo, normal, depth], 1))
         # Negative weights have no meaning as proportions.
-        others = carried(frame) if self.normalize == "softmax" else None
-        x = x if others is None else torch.cat([x, others], 1)
+        x = with_carried(frame) if self.normalize == "softmax" else x
         images = []
         for scale, (head, level) in enumerate(zip(self.heads, levels, strict=True)):
             if scale:
                 x, normal, depth = downsample(x), downsample(normal), downsample(depth)
             predicted = head(level)  #                                                                          Eq. 3
-            w, f = predicted[:, : self.taps], F.softplus(predicted[:, self.taps :].to(x.dtype))
-            guides = [normal, depth] if self.bilateral else []
-            f1, f2, f3 = f.split(1, 1) if self.bilateral else (None, None, None)
-            scales = [f1, f2] if f1 is not None and f2 is not None else []
+            w, guides, scales, f3 = predicted[:, : self.taps], [], [], None
+            if self.bilateral:
+                f1, f2, f3 = F.softplus(predicted[:, self.taps :].to(x.dtype)).split(1, 1)
+                guides, scales = [normal, depth], [f1, f2]
             images.append(cross_bilateral_filter(x, w, guides, scales, f3, normalize=self.normalize))  #    Eqs. 4-8
-        if others is None:
-            return Output(self.fuse(images)), None
-        return answered(frame, *self.fuse_with(images)), None
+        return answered(frame, self.fuse(images)), None
 
 
 class _NonNegative(Wrapper):

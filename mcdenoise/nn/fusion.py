@@ -29,22 +29,17 @@ class FusionModule(nn.Module):
         both = torch.cat([fine, upsample(coarse, (fine.shape[-2], fine.shape[-1]))], 1)
         return torch.sigmoid(self.conv(both))
 
-    @staticmethod
-    def mean(fine: Tensor, coarse: Tensor, weight: Tensor) -> Tensor:
-        """Blend both scales by a weighted mean, for layers and alpha, which must stay between the two inputs.
-
-        Args:
-            fine: ``(B, C, H, W)``, any unit.
-            coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` in the same unit.
-            weight: ``(B, 1, H, W)`` weight of the coarse image.
-        """
-        return torch.lerp(fine, upsample(coarse, (fine.shape[-2], fine.shape[-1])), weight.to(fine.dtype))
-
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """Fuse two scales.
 
         Args:
-            fine: ``(B, 3, H, W)`` i_f, radiance.
-            coarse: ``(B, 3, ceil(H / 2), ceil(W / 2))`` i_c, radiance.
+            fine: ``(B, C, H, W)`` i_f, radiance, and after it layers and alpha in any unit. These are blended by a
+                weighted mean, because they must stay between the two inputs.
+            coarse: ``(B, C, ceil(H / 2), ceil(W / 2))`` i_c, likewise.
         """
-        return laplacian_fusion(fine, coarse, self.weight(fine, coarse))
+        weight = self.weight(fine[:, :3], coarse[:, :3])
+        color = laplacian_fusion(fine[:, :3], coarse[:, :3], weight)
+        if fine.shape[1] == 3:
+            return color
+        others = upsample(coarse[:, 3:], (fine.shape[-2], fine.shape[-1]))
+        return torch.cat([color, torch.lerp(fine[:, 3:], others, weight.to(fine.dtype))], 1)
