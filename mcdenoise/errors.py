@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, get_args
 
 # A channel name may have 255 bytes, and a path 4096.
 _LONGEST = 1500
@@ -43,6 +43,16 @@ def import_optional(package: str, use: str, extra: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise InputError(f"{use} needs {package}, which is not installed; pip install 'mcdenoise[{extra}]'") from error
+
+
+def check_choice(name: str, value: object, known: Any) -> None:
+    """Check that a setting is one of a ``Literal``.
+
+    Raises:
+        InputError: it is none of them.
+    """
+    if value not in get_args(known):
+        raise InputError(f"{name}: expected one of {', '.join(get_args(known))}, found {value!r}")
 
 
 def run_script(main: Callable[[], object]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,7 @@ from mcdenoise.denoiser._frames import dtype_of, explained, prepared
 from mcdenoise.denoiser._settings import check_kind, check_settings, usable_device
 from mcdenoise.denoiser._turns import in_turn, started
 from mcdenoise.denoiser._watch import REPEATED, Watch
-from mcdenoise.errors import InputError, level_of_caller
+from mcdenoise.errors import InputError, check_choice, level_of_caller
 from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
 from mcdenoise.models import DEFAULT, Model, Output, State, create_model
 from mcdenoise.models._adapter import as_model
@@ -120,9 +120,7 @@ class Denoiser:
         for name, switch in switches.items():
             check_kind(name, switch, (bool,), "True or False")
         self.device = usable_device(device)
-        known = get_args(AskedPrecision)
-        if precision not in known:
-            raise InputError(f"precision: expected one of {', '.join(known)}, found '{precision}'")
+        check_choice("precision", precision, AskedPrecision)
         self.keep_all, self.differentiable, self.alpha, self.wrap = keep_all, differentiable, alpha, wrap
         self._report, self._times = FrameReport(), Times(self.device)
         # Whether the last frame whose noise is known has enough of it to be computed in bfloat16.

@@ -6,7 +6,9 @@ import importlib.util
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
+
+from mcdenoise.errors import check_choice
 
 # How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
 # network; a filter without weights; another denoiser; or unspecified.
@@ -73,8 +75,7 @@ def register_model(
     Raises:
         ValueError: the name is taken, or the kind is unknown.
     """
-    if kind not in get_args(Kind):
-        raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, found '{kind}'")
+    check_choice("kind", kind, Kind)
 
     def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
         if name in MODELS:

@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
@@ -36,6 +36,7 @@ from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 
 Normalize = Literal["softmax", "none"]
+Cascade = Literal["P", "K", "P+K", "K+P", "K+K"]
 
 LEVELS = 4  # of the U-Net
 
@@ -134,7 +135,7 @@ class _NonNegative(Wrapper):
 def cascaded(
     width: int = 40,
     kernel_size: int = 5,
-    cascade: str = "P+K",
+    cascade: Cascade = "P+K",
     bilateral: bool = True,
     normalize: Normalize = "softmax",
 ) -> Model:
@@ -150,8 +151,7 @@ def cascaded(
     Raises:
         InputError: there is no such cascade.
     """
-    if cascade not in ("P", "K", "P+K", "K+P", "K+K"):
-        raise InputError(f"cascade: expected one of P, K, P+K, K+P, K+K, found '{cascade}'")
+    check_choice("cascade", cascade, Cascade)
     networks: list[Model] = [
         Tiled(PixelNetwork(width) if part == "P" else KernelNetwork(width, kernel_size, bilateral, normalize))
         for part in cascade.split("+")

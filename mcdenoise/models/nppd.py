@@ -46,7 +46,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, check_choice
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
@@ -298,8 +298,7 @@ def nppd(width: int = 18, backbone: Backbone = "convunet") -> Nppd:
     Raises:
         InputError: the backbone is unknown or does not support this width.
     """
-    if backbone not in ("convunet", "convunext"):
-        raise InputError(f"backbone: expected convunet or convunext, found '{backbone}'")
+    check_choice("backbone", backbone, Backbone)
     step = 1 if backbone == "convunet" else 4
     if width < 1 or width % step:
         raise InputError(f"width: expected a positive multiple of {step} for {backbone}, found {width}")

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 import weakref
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError, import_optional
+from mcdenoise.errors import InputError, check_choice, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State
@@ -213,12 +213,6 @@ def guides_of(frame: Frame) -> dict[str, Tensor]:
     """The features that the library accepts; a normal only together with an albedo."""
     given = {"albedo": frame.albedo, "normal": frame.normal if frame.albedo is not None else None}
     return {name: image for name, image in given.items() if image is not None}
-
-
-def check_choice(name: str, value: str, known: Any) -> None:
-    """``InputError`` for a setting that is none of a ``Literal``."""
-    if value not in get_args(known):
-        raise InputError(f"{name}: expected one of {', '.join(get_args(known))}, found '{value}'")
 
 
 def _import_oidn() -> Any:

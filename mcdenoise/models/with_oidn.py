@@ -21,11 +21,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._precision import fastest_precision
 from mcdenoise.models._wrapper import Wrapper
-from mcdenoise.models.oidn import Filters, Oidn, Quality, check_choice
+from mcdenoise.models.oidn import Filters, Oidn, Quality
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.models.tiled import with_border, without_border
 from mcdenoise.noise import noise_is_spread
