@@ -296,7 +296,7 @@ def _smoothed(image: Image) -> Image:
     return means.movedim(0, -1).contiguous().numpy()
 
 
-def doubt_motion(frame: Frame, before: Seen | None) -> str:
+def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
     """What is wrong with the motion of a frame, in a line for a warning; empty if nothing is known to be wrong.
 
     The matrix must project positions to their own pixels. Motion, or positions under the previous matrix, is wrong if
@@ -305,11 +305,11 @@ def doubt_motion(frame: Frame, before: Seen | None) -> str:
 
     Args:
         frame: on a CPU; the first frame of its batch is examined.
-        before: the frame before it, of the same size; ``None`` for the first one.
+        seen: the same by :func:`seen_in`.
+        before: likewise, the frame before it, of the same size; ``None`` for the first one.
     """
-    camera = None if frame.view_projection is None else frame.view_projection[0].detach().double().numpy()
-    if frame.position is not None and camera is not None:
-        convention, _ = read_as(camera, _pixels(frame, "position"), _hit(frame))
+    if frame.position is not None and seen.camera is not None:
+        convention, _ = read_as(seen.camera, _pixels(frame, "position"), _hit(frame))
         if convention not in ("", "unknown"):
             return (
                 "'view_projection': wrong, which is worse than no motion: positions are projected to their own pixels "
@@ -317,7 +317,7 @@ def doubt_motion(frame: Frame, before: Seen | None) -> str:
             )
     if before is None:
         return ""
-    now = seen_in(frame).features
+    now = seen.features
     if {name: each.shape for name, each in now.items()} != {name: each.shape for name, each in before.features.items()}:
         return ""
     for name in ("motion", "previous_position", "position"):

@@ -57,8 +57,8 @@ def shot(
 
 
 def told(frames: list[Frame]) -> list[str]:
-    seen = [None, *(seen_in(frame) for frame in frames)]
-    return [doubt_motion(frame, before) for frame, before in zip(frames, seen, strict=False)]
+    seen = [seen_in(frame) for frame in frames]
+    return list(map(doubt_motion, frames, seen, [None, *seen[:-1]]))
 
 
 def warned(frames: list[Frame], **arguments: Any) -> list[str]:
@@ -154,7 +154,7 @@ def test_noise_alone_tells_nothing_of_motion(moves: float) -> None:
         Frame(*torch.rand(2, 1, 3, 48, 64), normal=torch.rand(1, 3, 48, 64), motion=moves * torch.randn(1, 2, 48, 64))
         for _ in range(2)
     ]
-    assert doubt_motion(frames[1], seen_in(frames[0])) == ""
+    assert doubt_motion(frames[1], seen_in(frames[1]), seen_in(frames[0])) == ""
 
 
 def test_what_is_not_used_is_not_doubted() -> None:

@@ -38,6 +38,6 @@ class Watch(NamedTuple):
         pixels = thinned(frame) if noise else None
         last = self.pixels
         repeats = pixels is not None and last is not None and noise_is_repeated(frame, pixels, last)
-        doubt = doubt_motion(frame, self.compared) if motion and self.left else ""
-        compared = seen_in(frame) if motion and self.left and not doubt else None
-        return Watch(pixels, compared, 0 if doubt else max(self.left - 1, 0)), repeats, doubt
+        seen = seen_in(frame) if motion and self.left else None
+        doubt = "" if seen is None else doubt_motion(frame, seen, self.compared)
+        return Watch(pixels, None if doubt else seen, 0 if doubt else max(self.left - 1, 0)), repeats, doubt
