@@ -42,10 +42,15 @@ def carried(frame: Frame) -> Tensor | None:
     return torch.cat(images, 1) if images else None
 
 
-def with_carried(frame: Frame) -> Tensor:
-    """The color with :func:`carried` concatenated, ``(B, 3 + 3 L + 1, H, W)``: all channels that share the kernels."""
-    others = carried(frame)
-    return frame.color if others is None else torch.cat([frame.color, others], 1)
+def with_carried(frame: Frame, image: Tensor | None = None) -> Tensor:
+    """The color with :func:`carried` concatenated, ``(B, 3 + 3 L + 1, H, W)``: all channels that share the kernels.
+
+    Args:
+        frame: with layers and alpha, as far as they are requested.
+        image: ``(B, 3, H, W)`` that takes the place of the color.
+    """
+    image, others = frame.color if image is None else image, carried(frame)
+    return image if others is None else torch.cat([image, others.to(image.dtype)], 1)
 
 
 def alpha_of(frame: Frame) -> Tensor | None:

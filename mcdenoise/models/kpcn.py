@@ -44,7 +44,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
-from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, check_odd, published
 from mcdenoise.models.svgf import BRIGHTEST
 from mcdenoise.nn.inputs import unit_features_of
@@ -66,12 +66,9 @@ class _Branch(nn.Sequential):
             modules += [nn.Conv2d(entering, leaving, _CONVOLUTION, padding=_CONVOLUTION // 2), nn.ReLU(inplace=True)]
         super().__init__(*modules[:-1])
 
-    def filtered(self, image: Tensor, others: Tensor | None, frame: Frame) -> tuple[Tensor, Tensor | None]:
-        """Filter ``(B, 3, H, W)`` with the kernels predicted for it, and other channels with the same kernels."""
-        logits = self(_seen(image, frame))
-        together = image if others is None else torch.cat([image, others], 1)
-        found = cross_bilateral_filter(together, logits, border="renormalize")
-        return found[:, :3], None if others is None else found[:, 3:]
+    def filtered(self, image: Tensor, frame: Frame) -> Tensor:
+        """Filter ``(B, 3, H, W)`` with the kernels predicted for it, and after it layers and alpha with the same."""
+        return cross_bilateral_filter(with_carried(frame, image), self(_seen(image, frame)), border="renormalize")
 
 
 class KpcnNetwork(Network):
@@ -104,26 +101,24 @@ class KpcnNetwork(Network):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
-        others = carried(frame)
         if frame.diffuse is None or frame.specular is None or self.specular is None:
             reason = "these weights are for color alone" if self.specular is None else "no diffuse and specular light"
-            image, others = self.diffuse.filtered(frame.color, others, frame)
-            return answered(frame, image, others).noted(Note("specular branch", reason, 1.0)), None
-        matt, of_matt = self.diffuse.filtered(frame.diffuse, others, frame)
-        logarithm, of_shiny = self.specular.filtered(torch.log1p(frame.specular), others, frame)
-        shiny = torch.expm1(logarithm)
+            image = self.diffuse.filtered(frame.color, frame)
+            return answered(frame, image).noted(Note("specular branch", reason, 1.0)), None
+        of_matt = self.diffuse.filtered(frame.diffuse, frame)
+        of_shiny = self.specular.filtered(torch.log1p(frame.specular), frame)
+        shiny = torch.expm1(of_shiny[:, :3])
         if frame.emission is not None:
             shiny = shiny + frame.emission
         if frame.albedo is not None:
             # Demodulated multiplies the whole result by the albedo, so the specular part is divided by it here.
             shiny = demodulate(shiny, frame.albedo)
-        image = matt + shiny
-        if of_matt is not None and of_shiny is not None:
+        image = of_matt[:, :3] + shiny
+        if of_matt.shape[1] > 3:
             lit = image > 0
             part = torch.where(lit, shiny / torch.where(lit, image, 1), 0).mean(1, keepdim=True)
-            others = torch.lerp(of_matt, of_shiny, part)
-        note = Note("specular branch", "diffuse and specular light")
-        return answered(frame, image, others).noted(note), None
+            image = torch.cat([image, torch.lerp(of_matt[:, 3:], of_shiny[:, 3:], part)], 1)
+        return answered(frame, image).noted(Note("specular branch", "diffuse and specular light")), None
 
 
 def _seen(image: Tensor, frame: Frame) -> Tensor:
