@@ -31,13 +31,7 @@ class Blended(NamedTuple):
 
 
 def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
-    """How much brighter the light is than both histories say, over windows of 48x48 pixels.
-
-    A change that is small beside the noise of a pixel is seen by no test of single pixels, and stays in a history for
-    long. With the means over a window ``m_f`` and ``m_h`` of the fourth roots of frame and history, ``d = m_f - m_h``,
-    and ``m_v`` the mean variance of the frame's root over the history, the factor is ``1 + w d / m_h`` with
-    ``w = max(1 - 8 m_v / (n d^2), 0)``: a James-Stein estimate, which takes for noise what may be noise. Means of roots
-    are those of the frame, whatever the noise of each, and one firefly does not hide all else.
+    """How much brighter the light is than both histories say: the factors of their channels.
 
     Args:
         history: ``(B, 9, H, W)`` with this frame.
@@ -45,20 +39,40 @@ def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
         root: ``(B, 1, H, W)`` fourth root of this frame's radiance.
 
     Returns:
-        ``(B, 9, H, W)`` factors of the channels, 1 where there is no history; no derivative.
+        ``(B, 9, H, W)``, between the blocks of :func:`root_changes` bilinearly interpolated, and 1 where there is no
+        history; no derivative.
     """
     history, counted = history.detach(), length.clamp_min(2)
     mean, recent = history[:, MEAN], history[:, RECENT_MEAN]
     variance = (history[:, SQUARE] - mean.square()).clamp_min(0) * (counted / (counted - 1))
     each = torch.cat([mean, recent, root.detach().to(mean.dtype), variance], 1)
-    blocks = F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False)
-    blocks = F.avg_pool2d(blocks, 3, 1, 1, count_include_pad=False)
-    before, now, noise = blocks.split([2, 1, 1], 1)
-    change, noise = now - before, noise * (RELIT_DOUBT / (9 * RELIT_BLOCK**2))
-    tiny = torch.finfo(change.dtype).tiny
-    kept = (1 - noise / change.square().clamp_min(tiny)).clamp_min(0)
-    factors = (1 + kept * change / before.clamp_min(tiny)).clamp(*RELIT)
+    factors = root_changes(F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False))
     wide = F.interpolate(factors, scale_factor=RELIT_BLOCK, mode="bilinear", align_corners=False)
     one, short = torch.where(length > 1, corner(wide, *history.shape[-2:]), 1).split(1, 1)
     colors = [image.square().square().expand(-1, 3, -1, -1) for image in (one, short)]
     return torch.cat([colors[0], one, one.square(), colors[1], short], 1)
+
+
+def root_changes(blocks: Tensor) -> Tensor:
+    """By how much the fourth root of the light has changed, in windows of 3x3 blocks of 16x16 pixels.
+
+    A change that is small beside the noise of a pixel is seen by no test of few pixels, and stays in a history for
+    long. With the means over a window of the roots of the frame ``m_f`` and of a history ``m_h``, ``d = m_f - m_h``,
+    and the mean variance ``m_v`` of the frame's root over the history, the factor is ``1 + w d / m_h`` with
+    ``w = max(1 - 8 m_v / (n d^2), 0)``: a James-Stein estimate, which takes for noise what may be noise. Means of roots
+    are those of the frame, whatever the noise of each, and one firefly does not hide all else.
+
+    Args:
+        blocks: ``(B, 4, h, w)`` means over blocks: roots of the whole and of the recent history, and of the frame; and
+            the variance.
+
+    Returns:
+        ``(B, 2, h, w)`` factors of the roots of both histories, within (0.7, 1.4).
+    """
+    windows = F.avg_pool2d(blocks, 3, 1, 1, count_include_pad=False)
+    before, now, noise = windows.split([2, 1, 1], 1)
+    change, noise = now - before, noise * (RELIT_DOUBT / (9 * RELIT_BLOCK**2))
+    tiny = torch.finfo(change.dtype).tiny
+    kept = (1 - noise / change.square().clamp_min(tiny)).clamp_min(0)
+    factors: Tensor = (1 + kept * change / before.clamp_min(tiny)).clamp(*RELIT)
+    return factors

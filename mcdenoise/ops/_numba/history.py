@@ -19,12 +19,14 @@ from mcdenoise.ops._constants import (
     LIGHT_WINDOW,
     RECENT_ALPHA,
     RECENT_FRAMES,
+    RELIT_BLOCK,
     SMALLEST_LAG,
 )
-from mcdenoise.ops._history import MEAN, Blended, light_changes
+from mcdenoise.ops._history import Blended, root_changes
 from mcdenoise.ops._numba._runtime import add, compiled, copy_row, read_row, share_rows, source
 from mcdenoise.ops._numba.temporal import Shorter, between, blended
 from mcdenoise.ops._surface import Surface
+from mcdenoise.ops._window import parts_of
 
 _RADIUS = LAG_WINDOW // 2
 
@@ -187,7 +189,7 @@ def blend(
     )
     if not math.isinf(lag_threshold):
         _discard_lag(color, length, entering, lag_threshold, recent_alpha)
-        color *= light_changes(color, length, entering[:, MEAN])
+        _follow_light(color, length, entering)
     return Blended(color, length, counts.sum(1) / max(length.shape[-2] * length.shape[-1], 1))
 
 
@@ -345,3 +347,78 @@ def _find_lag(
                 square = history[b, 8, row, x] * history[b, 8, row, x] + variance[x]
                 history[b, 4, row, x] = between(history[b, 4, row, x], square, much)
                 length[x] = between(length[x], min(length[x], shortest), much)
+
+
+def _follow_light(history: Tensor, length: Tensor, color: Tensor) -> None:
+    """Scale both histories by the change of the light, see :func:`mcdenoise.ops._history.light_changes`.
+
+    Args:
+        history: ``(B, 9, H, W)`` contiguous; changed.
+        length: ``(B, 1, H, W)`` contiguous.
+        color: ``(B, 5, H, W)`` of the current frame, as :func:`incoming` has it.
+    """
+    batch, _, height, width = history.shape
+    blocks = history.new_empty((batch, 4, parts_of(height, RELIT_BLOCK), parts_of(width, RELIT_BLOCK)))
+    if not blocks.numel():
+        return
+    images = history.numpy(), length.numpy(), color.to(history.dtype).contiguous().numpy()
+    share_rows(blocks, lambda *rows: _mean_blocks(blocks.numpy(), *images, *rows), light=True)
+    factors = root_changes(blocks)
+    # In most frames the light has not changed.
+    if factors.ne(1).any():
+        share_rows(history, lambda *rows: _scale(*images[:2], factors.numpy(), *rows), light=True)
+
+
+@compiled
+def _mean_blocks(blocks: Any, history: Any, lengths: Any, color: Any, b: int, first: int, last: int) -> None:
+    _, _, height, width = history.shape
+    columns = blocks.shape[3]
+    number = blocks.dtype.type
+    sums, variance = np.empty((4, width), blocks.dtype), np.empty(width, blocks.dtype)
+    for block in range(first, last):
+        top, bottom = block * RELIT_BLOCK, min((block + 1) * RELIT_BLOCK, height)
+        sums[:] = 0
+        for y in range(top, bottom):
+            add(sums[0], history[b, 3, y])
+            add(sums[1], history[b, 8, y])
+            add(sums[2], color[b, 3, y])
+            _variance(variance, history[b, 3, y], history[b, 4, y], lengths[b, 0, y])
+            add(sums[3], variance)
+        for column in range(columns):
+            left, right = column * RELIT_BLOCK, min((column + 1) * RELIT_BLOCK, width)
+            for k in range(4):
+                total = number(0)
+                for x in range(left, right):
+                    total += sums[k, x]
+                blocks[b, k, block, column] = total / number((bottom - top) * (right - left))
+
+
+@compiled
+def _scale(history: Any, lengths: Any, factors: Any, b: int, first: int, last: int) -> None:
+    """Multiply the channels of both histories by powers of their roots' factors, bilinearly interpolated."""
+    width = history.shape[3]
+    _, _, rows, columns = factors.shape
+    number = history.dtype.type
+    half, one, zero = number(0.5), number(1), number(0)
+    row = np.empty(columns + 1, history.dtype)
+    for y in range(first, last):
+        place = max((number(y) + half) / number(RELIT_BLOCK) - half, zero)
+        above = int(place)
+        below, down = min(above + 1, rows - 1), place - number(above)
+        for k in range(2):
+            for column in range(columns):
+                row[column] = between(factors[b, k, above, column], factors[b, k, below, column], down)
+            row[columns] = row[columns - 1]
+            # Channels: color, root and square of the whole history; color and root of the recent one.
+            start, root = (0, 3) if k == 0 else (5, 8)
+            for x in range(width):
+                across = max((number(x) + half) / number(RELIT_BLOCK) - half, zero)
+                before = int(across)
+                factor = between(row[before], row[before + 1], across - number(before))
+                if lengths[b, 0, y, x] > one and factor != one:
+                    square = factor * factor
+                    history[b, root, y, x] *= factor
+                    if k == 0:
+                        history[b, 4, y, x] *= square
+                    for c in range(start, start + 3):
+                        history[b, c, y, x] *= square * square
