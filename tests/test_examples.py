@@ -369,6 +369,7 @@ def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path
     recipe = tmp_path / "recipe.toml"
     recipe.write_text('[train]\nmodel = "wild_small"\ncrop = 32\nlamps = 0.5\nkey = 0.2\n[[data]]\nseeds = "0"\n')
     options = ("--recipe", recipe, "--seconds", "4", "--clips", "2", "--device", "cpu", "--validation", packed)
+    options += ("--kept", "0.5")
     *_, weights = run("gpu/train.py", packed, "-o", tmp_path / "out", *options).splitlines()
     assert create_model("wild_small", weights=Path(weights)) is not None
     first, *_, last = map(json.loads, (tmp_path / "out" / "log.jsonl").read_text().splitlines())

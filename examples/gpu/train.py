@@ -224,10 +224,13 @@ class Run:
     Args:
         config: of the recipe.
         device: that trains.
+        kept: part of the weights that it begins with, in those that it writes (Wortsman et al. 2022, "Robust
+            fine-tuning of zero-shot models"): what few takes show is not forgotten.
     """
 
     config: TrainConfig
     device: torch.device
+    kept: float = 0.0
 
     def __post_init__(self) -> None:
         config = self.config
@@ -235,7 +238,7 @@ class Run:
         random.seed(config.seed)
         self.network, self.settings, self.start = begun(config)
         self.network.to(self.device, memory_format=torch.channels_last)
-        self.average = copy.deepcopy(self.network).requires_grad_(False)
+        self.average, self.first = (copy.deepcopy(self.network).requires_grad_(False) for _ in range(2))
         weights = dict(self.network.named_parameters())
         random_ones = [weights.pop(name) for name in list(weights) if ".trust." in name]
         groups = [{"params": list(weights.values()), "pace": 1.0}, {"params": random_ones, "pace": FASTER}]
@@ -286,13 +289,15 @@ class Run:
         random.seed(self.config.seed + self.steps)
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
-        """Write the averaged weights."""
+        """Write the averaged weights, with a part of the first ones."""
         commits = [{"first_step": 0, "commit": source_commit()}]
         config = asdict(replace(self.config, steps=self.steps))
         identity = identity | {"initial_weights": self.start["sha256"]}
-        about = about_weights(config, identity, self.steps, commits, self.start["data"])
+        about = about_weights(config, identity, self.steps, commits, self.start["data"]) | {"kept": str(self.kept)}
+        mean = copy.deepcopy(self.average)
+        torch._foreach_lerp_(list(mean.parameters()), list(self.first.parameters()), self.kept)
         with atomic_path(path) as temporary:
-            temporary.write_bytes(save_weights(self.average, self.config.model, self.settings, about))
+            temporary.write_bytes(save_weights(mean, self.config.model, self.settings, about))
 
 
 def main() -> None:
@@ -303,6 +308,7 @@ def main() -> None:
     parser.add_argument("--run", default="", metavar="NAME", help="of the recipe; not needed where it has only one")
     parser.add_argument("--seconds", type=float, default=300.0, help="in all, from the start of the script on")
     parser.add_argument("--clips", type=int, default=32, help="single frames in a step, instead of the recipe's batch")
+    parser.add_argument("--kept", type=float, default=0.0, metavar="PART", help="of the first weights, in the result")
     parser.add_argument("--validation", type=Path, metavar="FOLDER")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     options = parser.parse_args()
@@ -312,7 +318,7 @@ def main() -> None:
     recipe = Recipe.read(options.recipe, options_of("generate"))
     (chosen,) = recipe.chosen([options.run] if options.run else [recipe.runs[0].name])
     config = replace(chosen.config, batch=options.clips, frames=1, temporal_weight=0.0)
-    run, tiles = Run(config, device), Tiles(options.packed, device)
+    run, tiles = Run(config, device, options.kept), Tiles(options.packed, device)
     watched = Tiles(options.validation, device) if options.validation else None
     options.out.mkdir(parents=True, exist_ok=True)
     names = (f"{config.model}.safetensors", "log.jsonl", "run.pt")
