@@ -379,3 +379,15 @@ def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path
     # The same command again has no seconds left, and makes no step.
     run("gpu/train.py", packed, "-o", tmp_path / "out", *options)
     assert json.loads((tmp_path / "out" / "log.jsonl").read_text().splitlines()[-1])["step"] == last["step"]
+
+
+def test_only_what_weighs_the_history_learns_which_one_to_take(packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "chosen.safetensors"
+    run("gpu/choice.py", packed, "-o", out, "--weights", "wild_small", "--steps", "20")
+    before, after = (
+        dict(create_model("wild_small", **source).named_parameters())
+        for source in ({"pretrained": True}, {"weights": out})
+    )
+    changed = {name for name, weight in before.items() if not torch.equal(weight, after[name])}
+    assert any("trust.last" in name for name in changed)
+    assert all(".trust." in name for name in changed)
