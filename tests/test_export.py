@@ -229,7 +229,7 @@ def test_a_graph_counts_and_clamps_as_python_does(make: Callable[[], Model], tmp
     # A height of which a sixteenth is no whole number.
     (buffers, other, *_) = frames((33, 47))
     length = torch.full_like(buffers["color"][:, :1], 4.0)
-    shot = [buffers | {"current": other["color"], "length": length}]
+    shot = [buffers | {"current": other["color"], "recent": other["color"], "length": length}]
     assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
 
 

@@ -13,7 +13,7 @@ from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
 HEIGHT, WIDTH = 5, 7
 MODEL = "wild_small"
 # Accumulated adds these buffers to a frame: no renderer writes them.
-OWN = {"current", "length"}
+OWN = {"current", "recent", "length"}
 
 
 def image(channels: int, layout: Layout = "HWC", *, seed: int = 0, dtype: Any = np.float32) -> np.ndarray[Any, Any]:

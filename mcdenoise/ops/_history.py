@@ -46,32 +46,40 @@ def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
     mean, recent = history[:, MEAN], history[:, RECENT_MEAN]
     variance = (history[:, SQUARE] - mean.square()).clamp_min(0) * (counted / (counted - 1))
     each = torch.cat([mean, recent, root.detach().to(mean.dtype), variance], 1)
-    factors = root_changes(F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False))
+    blocks = F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False)
+    factors = root_changes(blocks, *history.shape[-2:])
     wide = F.interpolate(factors, scale_factor=RELIT_BLOCK, mode="bilinear", align_corners=False)
     one, short = torch.where(length > 1, corner(wide, *history.shape[-2:]), 1).split(1, 1)
     colors = [image.square().square().expand(-1, 3, -1, -1) for image in (one, short)]
     return torch.cat([colors[0], one, one.square(), colors[1], short], 1)
 
 
-def root_changes(blocks: Tensor) -> Tensor:
+def root_changes(blocks: Tensor, height: int, width: int) -> Tensor:
     """By how much the fourth root of the light has changed, in windows of 3x3 blocks of 16x16 pixels.
 
     A change that is small beside the noise of a pixel is seen by no test of few pixels, and stays in a history for
-    long. With the means over a window of the roots of the frame ``m_f`` and of a history ``m_h``, ``d = m_f - m_h``,
-    and the mean variance ``m_v`` of the frame's root over the history, the factor is ``1 + w d / m_h`` with
-    ``w = max(1 - 8 m_v / (n d^2), 0)``: a James-Stein estimate, which takes for noise what may be noise. Means of roots
-    are those of the frame, whatever the noise of each, and one firefly does not hide all else.
+    long. With the means over the ``n`` pixels of a window of the roots of the frame ``m_f`` and of a history ``m_h``,
+    ``d = m_f - m_h``, and the mean variance ``m_v`` of the frame's root over the history, the factor is
+    ``1 + w d / m_h`` with ``w = max(1 - 8 m_v / (n d^2), 0)``: a James-Stein estimate, which takes for noise what may
+    be noise. Means of roots are those of the frame, whatever the noise of each, and one firefly does not hide all else.
 
     Args:
         blocks: ``(B, 4, h, w)`` means over blocks: roots of the whole and of the recent history, and of the frame; and
             the variance.
+        height: of the image.
+        width: of the image.
 
     Returns:
         ``(B, 2, h, w)`` factors of the roots of both histories, within (0.7, 1.4).
     """
-    windows = F.avg_pool2d(blocks, 3, 1, 1, count_include_pad=False)
-    before, now, noise = windows.split([2, 1, 1], 1)
-    change, noise = now - before, noise * (RELIT_DOUBT / (9 * RELIT_BLOCK**2))
+    rows, columns = (
+        (length - RELIT_BLOCK * torch.arange(count, dtype=blocks.dtype, device=blocks.device)).clamp_max(RELIT_BLOCK)
+        for length, count in zip((height, width), blocks.shape[-2:], strict=True)
+    )
+    pixels = (rows[:, None] * columns).expand_as(blocks[:, :1])
+    sums = 9 * F.avg_pool2d(torch.cat([blocks * pixels, pixels], 1), 3, 1, 1)
+    before, now, noise, _ = (sums / sums[:, 4:]).split([2, 1, 1, 1], 1)
+    change, noise = now - before, noise * RELIT_DOUBT / sums[:, 4:]
     tiny = torch.finfo(change.dtype).tiny
     kept = (1 - noise / change.square().clamp_min(tiny)).clamp_min(0)
     factors: Tensor = (1 + kept * change / before.clamp_min(tiny)).clamp(*RELIT)

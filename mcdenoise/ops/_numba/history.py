@@ -363,7 +363,7 @@ def _follow_light(history: Tensor, length: Tensor, color: Tensor) -> None:
         return
     images = history.numpy(), length.numpy(), color.to(history.dtype).contiguous().numpy()
     share_rows(blocks, lambda *rows: _mean_blocks(blocks.numpy(), *images, *rows), light=True)
-    factors = root_changes(blocks)
+    factors = root_changes(blocks, height, width)
     # In most frames the light has not changed.
     if factors.ne(1).any():
         share_rows(history, lambda *rows: _scale(*images[:2], factors.numpy(), *rows), light=True)
