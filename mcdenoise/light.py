@@ -18,9 +18,9 @@ from mcdenoise.ops._rows import by_rows
 LARGEST_RADIANCE = 1e16
 # Least radiance of an infinite light without finite neighbours: the largest that a half float holds.
 _SUN = 65504.0
-# Negative light above this fraction of a channel is noise around its mean, which must be kept; and above this fraction
-# of the positive light of an image, the image is no radiance.
-_MANY, _MOST_NEGATIVE = 0.01, 0.5
+# Negative light above this fraction of a channel's light of both signs is noise around its mean, which must be kept;
+# above this fraction of an image's, half as much as there is positive light, the image is no radiance.
+_MANY, _MOST_NEGATIVE = 0.01, 1 / 3
 # Mean negative light that is too little to refuse an image for: the rounding of a black one.
 _LEAST_NEGATIVE = 1e-5
 # A layer with a larger fraction of invalid pixels is not radiance; replacing them would damage the color.
@@ -228,23 +228,16 @@ def repairs_from(numbers: Sequence[float], layers: Sequence[str]) -> Repairs:
         start = _COLOR_NUMBERS + _LAYER_NUMBERS * number
         broken, signed = numbers[start : start + _LAYER_NUMBERS]
         if broken > _MOST_BROKEN or signed > _MOST_NEGATIVE:
-            share = f"{_share(signed):.0%} of its light negative"
-            if broken > _MOST_BROKEN:
-                share = f"in {broken:.0%} of the pixels"
+            share = f"in {broken:.0%} of the pixels" if broken > _MOST_BROKEN else f"{signed:.0%} of its light negative"
             raise InputError(f"layer '{name}': expected radiance, not negative and finite, found {share}; leave it out")
     if empty:
         raise InputError("buffer 'color': expected radiance, found NaN in every pixel; render the frame again")
     if ratio > _MOST_NEGATIVE:
         raise InputError(
-            f"buffer 'color': expected radiance, not negative, found {_share(ratio):.0%} of the light negative, "
+            f"buffer 'color': expected radiance, not negative, found {ratio:.0%} of the light negative, "
             "so it holds something else, such as a difference; give the radiance itself"
         )
     return Repairs(int(filled), int(limited), int(clamped), negative, gained, (int(row), int(column)))
-
-
-def _share(ratio: float) -> float:
-    """Negative light as a fraction of all light, from its ratio to the positive light, which may be infinite."""
-    return 1 / (1 + 1 / ratio) if ratio else 0.0
 
 
 def _hole(image: Tensor) -> Tensor:
@@ -263,12 +256,12 @@ def _numbers_of(image: Tensor, hole: Tensor) -> Tensor:
 
 
 def _negative(image: Tensor, hole: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """All light of an image; its negative light as a fraction of the positive; and that of each channel of its own."""
+    """All light of an image; its negative light, and that of each channel, as a fraction of the light of both signs."""
     known = _numbers_of(image, hole).float()
     positive, negative = known.clamp_min(0).mean((2, 3), keepdim=True), -known.clamp_max(0).mean((2, 3), keepdim=True)
     tiny = torch.finfo(torch.float32).tiny
     of_image = positive.sum((1, 2, 3)), negative.sum((1, 2, 3))
-    ratio = torch.where(of_image[1] > _LEAST_NEGATIVE, of_image[1] / of_image[0].clamp_min(tiny), 0)
+    ratio = torch.where(of_image[1] > _LEAST_NEGATIVE, of_image[1] / (of_image[0] + of_image[1]).clamp_min(tiny), 0)
     light = (of_image[0] - of_image[1]).clamp_min(tiny) * image.shape[2] * image.shape[3]
     return light, ratio, negative / (positive + negative).clamp_min(tiny)
 
