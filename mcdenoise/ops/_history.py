@@ -30,6 +30,12 @@ class Blended(NamedTuple):
     kept: Tensor
 
 
+def root_variance(history: Tensor, length: Tensor) -> Tensor:
+    """The variance of the noise of one frame's root ``(B, 1, H, W)``, from a history of that length."""
+    counted = length.clamp_min(2)
+    return (history[:, SQUARE] - history[:, MEAN].square()).clamp_min(0) * (counted / (counted - 1))
+
+
 def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
     """How much brighter the light is than both histories say: the factors of their channels.
 
@@ -42,10 +48,8 @@ def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
         ``(B, 9, H, W)``, between the blocks of :func:`root_changes` bilinearly interpolated, and 1 where there is no
         history; no derivative.
     """
-    history, counted = history.detach(), length.clamp_min(2)
-    mean, recent = history[:, MEAN], history[:, RECENT_MEAN]
-    variance = (history[:, SQUARE] - mean.square()).clamp_min(0) * (counted / (counted - 1))
-    each = torch.cat([mean, recent, root.detach().to(mean.dtype), variance], 1)
+    history, root = history.detach(), root.detach().to(history.dtype)
+    each = torch.cat([history[:, MEAN], history[:, RECENT_MEAN], root, root_variance(history, length)], 1)
     blocks = F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False)
     factors = root_changes(blocks, *history.shape[-2:])
     wide = F.interpolate(factors, scale_factor=RELIT_BLOCK, mode="bilinear", align_corners=False)

@@ -18,7 +18,7 @@ from mcdenoise.ops._constants import (
     RECENT_FRAMES,
     STILL,
 )
-from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes
+from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes, root_variance
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._surface import Rule, Surface
 from mcdenoise.ops._window import corner
@@ -255,9 +255,7 @@ def _without_lag(
     threshold: float, alpha_min: float, recent_alpha: float, color: Tensor, blended: Tensor, length: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Color and length without lag: the frame corrects the recent history, and the recent history the long one."""
-    mean, square = blended[:, MEAN], blended[:, SQUARE]
-    counted = length.clamp_min(2)
-    variance = (square - mean.square()).clamp_min(0) * (counted / (counted - 1))
+    mean, variance = blended[:, MEAN], root_variance(blended, length)
     # Accumulated with the long one's weight of the frame, which is the smaller one.
     weight = _weight_of_history(length, recent_alpha) / _weight_of_history(length, alpha_min).clamp_min(1e-6)
     recent = torch.lerp(color[:, RECENT], blended[:, RECENT], weight)
