@@ -11,13 +11,12 @@ processor. All other weights stay as they are, and how much it trusts a history 
 import argparse
 import copy
 import json
-import math
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from train import Tiles
+from train import Tiles, by_level, rate_of
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
@@ -54,9 +53,7 @@ def tried(model: nn.Module, trust: Trust, tiles: Tiles) -> tuple[Tensor, Tensor,
         found.append(torch.cat(errors, 1))
         levels.append(take["spp"])
     handle.remove()
-    # Each noise level by the square root of its number of shots.
-    drawn = torch.tensor([1 / math.sqrt(levels.count(level)) for level in levels])
-    return torch.cat(seen), torch.cat(found), drawn
+    return torch.cat(seen), torch.cat(found), by_level(torch.tensor(levels), torch.ones(len(levels)))
 
 
 def expected(errors: Tensor, whole: Tensor) -> Tensor:
@@ -70,9 +67,8 @@ def learn(trust: Trust, first: Trust, data: tuple[Tensor, Tensor, Tensor], steps
     """Train the choice, and print the expected change of the error."""
     optimizer = torch.optim.Adam(trust.parameters(), RATE)
     for step in range(steps):
-        rate = min(1, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
         for group in optimizer.param_groups:
-            group["lr"] = RATE * rate
+            group["lr"] = RATE * rate_of(step, WARM_UP, step / steps)
         which = torch.multinomial(data[2], BATCH, replacement=True)
         seen, errors = data[0][which], data[1][which]
         trusted, whole = (_PACE * trust.last(trust.layers(seen))).split(1, 1)
@@ -107,11 +103,10 @@ def main() -> None:
     data = tried(split(model)[1], trust, Tiles(options.packed, torch.device("cpu")))
     trust.load_state_dict(first.state_dict())
     learn(trust.requires_grad_(), first, data, options.steps)
-    settings = about.pop("settings")
-    choice = json.dumps({"steps": options.steps, "commit": source_commit()})
+    about["choice"] = json.dumps({"steps": options.steps, "commit": source_commit()})
+    architecture, settings = (about.pop(name) for name in ("architecture", "settings"))
     with atomic_path(options.out) as temporary:
-        kept = {name: text for name, text in about.items() if isinstance(text, str)}
-        temporary.write_bytes(save_weights(model, about["architecture"], settings, kept | {"choice": choice}))
+        temporary.write_bytes(save_weights(model, architecture, settings, about))
     print(options.out)
 
 

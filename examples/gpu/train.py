@@ -96,9 +96,7 @@ class Tiles:
             self.parts[path.name] = about
         rows = [[take[name] for name in ("first", "begun", "frames", "histories", "spp")] for take in self.takes]
         self.table = torch.tensor(rows, device=self.device)
-        frames, levels = self.table[:, 2].float(), self.table[:, 4].unique(return_inverse=True)[1]
-        of_level = torch.zeros(len(frames), device=self.device).index_add_(0, levels, frames)[levels]
-        self.weights = frames / of_level.sqrt()
+        self.weights = by_level(self.table[:, 4], self.table[:, 2].float())
 
     def _joined(self, part: Any, name: str) -> Tensor:
         low, high = (torch.from_numpy(part[f"{name}.{byte}"]).to(self.device) for byte in (0, 1))
@@ -129,6 +127,17 @@ class Tiles:
             images.rot90(turns, (1, 2)).flip(flip).permute(0, 3, 1, 2).float() for images in (fixed, history)
         )
         return augmented(fixed, history, rand[4:], config)
+
+
+def by_level(spp: Tensor, frames: Tensor) -> Tensor:
+    """How often each of several takes is drawn: a noise level by the square root of its number of frames."""
+    levels = spp.unique(return_inverse=True)[1]
+    return frames / torch.zeros_like(frames).index_add_(0, levels, frames)[levels].sqrt()
+
+
+def rate_of(step: int, warm_up: int, part: float) -> float:
+    """The learning rate over that of the recipe: a linear start, and a cosine over the whole run."""
+    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
 
 
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
@@ -250,7 +259,7 @@ class Run:
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
         """Make a step at a part of the time."""
         config = self.config
-        rate = min(1.0, (self.steps + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
+        rate = rate_of(self.steps, WARM_UP, part)
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * rate * group["pace"]
         frame, reference = tiles.draw(config, clips)
