@@ -17,6 +17,7 @@ import pytest
 import torch
 from commands import succeeds
 from numpy.typing import NDArray
+from safetensors.torch import load_file
 
 from mcdenoise import create_model
 from mcdenoise.data import open_sequence, read_exr
@@ -382,11 +383,12 @@ def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path
 
 
 def test_only_what_weighs_the_history_learns_which_one_to_take(packed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "chosen.safetensors"
-    run("gpu/choice.py", packed, "-o", out, "--weights", "wild_small", "--steps", "20")
+    run("gpu/choice.py", packed, "-o", tmp_path / "out", "--weights", "wild_small", "wild_large", "--steps", "20")
+    learnt = [tmp_path / "out" / f"{name}.safetensors" for name in ("wild_small", "wild_large")]
+    assert torch.equal(*(load_file(file)["trust.last.weight"] for file in learnt))
     before, after = (
         dict(create_model("wild_small", **source).named_parameters())
-        for source in ({"pretrained": True}, {"weights": out})
+        for source in ({"pretrained": True}, {"weights": learnt[0]})
     )
     changed = {name for name, weight in before.items() if not torch.equal(weight, after[name])}
     assert any("trust.last" in name for name in changed)
