@@ -6,7 +6,7 @@ The loss of the whole network hardly tells histories apart: most of it is noise.
 frame of each shot nine times: with the frame alone, the accumulated radiance, and the mean of both; and each of these
 with the recent history, the whole one, and the mean of both. A parabola through three errors in each direction tells
 the error of any choice in each block of pixels, and only the small network that chooses learns, in minutes on a
-processor. The others get the same, since it sees nothing that depends on their size. All other weights stay as they are.
+processor. The others get the same, since it sees nothing that depends on their size. All other weights stay.
 """
 
 import argparse
