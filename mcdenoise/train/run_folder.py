@@ -204,9 +204,10 @@ def about_weights(
         provenance: the commits that computed the steps.
         earlier: data that the first weights were trained on, whose authors are owed credit, too.
     """
+    packed = [identity["packed"]] if "packed" in identity else []
     return {
         "config": json.dumps(config),
-        "data": json.dumps([*earlier, *identity["sequences"]]),
+        "data": json.dumps([*earlier, *identity["sequences"], *packed]),
         "credits": identity["credits"],
         **({"recipe": identity["recipe"]} if "recipe" in identity else {}),
         "initial_weights": identity["initial_weights"],

@@ -604,16 +604,15 @@ def test_the_shipped_weights(file: Path) -> None:
 def test_compared_weights_have_equal_training_settings() -> None:
     about = {name: describe_weights(SHIPPED / "compared" / f"{name}.safetensors") for name in compared_models()}
     assert not set(about) & set(pretrained_models())
-    own = {"model", "loss", "temporal_weight"}
-    # The page of the zoo says that this one alone is of the present recipe.
-    assert json.loads(about.pop("cascaded")["config"])["crop"] == 128
-    configs = [json.loads(each["config"]) for each in about.values()]
-    assert all(
-        {k: v for k, v in each.items() if k not in own} == {k: v for k, v in configs[0].items() if k not in own}
-        for each in configs
-    )
-    for key in ("data", "initial_weights"):
-        assert len({each[key] for each in about.values()}) == 1
+    own = {"model", "settings", "loss", "temporal_weight"}
+    # The page of the zoo says which are of the present recipe.
+    present = {name for name, each in about.items() if json.loads(each["config"])["crop"] == 128}
+    assert present == {"cascaded", "kp", "kpcn"}
+    for names in (present - {"cascaded"}, set(about) - present):
+        configs = [json.loads(about[name]["config"]) for name in names]
+        assert len({json.dumps({k: v for k, v in each.items() if k not in own}) for each in configs}) == 1
+        for key in ("data", "initial_weights"):
+            assert len({about[name][key] for name in names}) == 1
 
 
 def test_weights_in_bfloat16_load(weights: Path) -> None:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
+from mcdenoise.data.shards import write_shard
 from mcdenoise.models import describe_weights, load_weights
 
 pytest.importorskip("lightning_fabric", reason="training needs the packages of mcdenoise[train]")
@@ -151,6 +152,15 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
     saved = torch.load(run / "checkpoint.pt", weights_only=True)["parts"][0]
     for key, tensor in load_weights(weights, MODEL).state_dict().items():
         assert torch.equal(tensor, saved[key].half().float())
+
+
+def test_weights_name_the_authors_of_packed_takes(tmp_path: Path) -> None:
+    arrays = {name: np.full((2, 3, 16, 16), 0.5) for name in ("color", "albedo", "normal", "reference")}
+    arrays |= {"reference_error": np.zeros((2, 3, 16, 16)), "depth": np.ones((2, 1, 16, 16))}
+    write_shard(tmp_path / "0.take.npz", {"credits": ["chair (Ann, CC-BY 3.0)"]}, arrays)
+    config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 0})
+    weights = train(config, [tmp_path / "0.take.npz"], tmp_path / "run")
+    assert json.loads(describe_weights(weights)["data"])[-1]["credits"] == ["Ann, CC-BY 3.0"]
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
