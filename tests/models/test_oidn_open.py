@@ -1,6 +1,5 @@
 """Open Image Denoise's network in torch: the library's own results, its equations, and archives of weights."""
 
-import importlib.util
 import itertools
 import math
 import struct
@@ -12,7 +11,7 @@ import pytest
 import torch
 from refusals import refused
 from torch import Tensor
-from toys import frame_of
+from toys import frame_of, has_oidn
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
@@ -23,9 +22,6 @@ from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
 from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
 
 NAME = "oidn_open"
-has_oidn = pytest.mark.skipif(
-    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
-)
 
 
 def lit(height: int = 45, width: int = 70, seed: int = 0) -> Frame:
@@ -198,8 +194,6 @@ def test_the_scale_of_radiance() -> None:
     assert float(scale[-1]) == pytest.approx(1, abs=1e-9)
     assert (scale.diff() > 0).all()
     torch.testing.assert_close(expand(scale), radiance, rtol=1e-7, atol=1e-12)
-    assert compress(torch.tensor([-1.0, 1e9])).tolist() == pytest.approx([0, 1], abs=1e-6)
-    assert expand(torch.tensor([-1.0])).item() == 0
 
 
 @pytest.mark.parametrize("function", [compress, expand])

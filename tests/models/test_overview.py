@@ -9,7 +9,7 @@ import pytest
 from torch import nn
 
 from mcdenoise.cli.models import models
-from mcdenoise.models import create_model, list_models, register_model
+from mcdenoise.models import Needs, create_model, list_models, register_model
 from mcdenoise.models._entries import Kind
 from mcdenoise.models._overview import overview
 from mcdenoise.models._weights import compared_models, pretrained_models
@@ -42,6 +42,7 @@ def test_lists_every_model_by_kind_and_name() -> None:
     assert small.kmacs_per_pixel > small.parameters / 64 / 1e3
     assert by_name["svgf"].needs == ["color", "depth", "normal"]
     assert by_name["noisy"].weights == "none"
+    assert create_model("noisy").needs == Needs(trainable=False, reach=0)
 
 
 def test_a_model_without_its_package_is_listed_with_the_reason(

@@ -73,36 +73,6 @@ def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None
         torch.testing.assert_close(image, noise.color, rtol=1e-3, atol=1e-3)
 
 
-def test_motion_comes_from_positions_and_cameras_too() -> None:
-    """A camera that shifts the image by two pixels, seen once in motion and once in positions."""
-    ys, xs = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-
-    def view(shift: float) -> tuple[Tensor, Tensor]:
-        """Parallel rays: world x and y are pixels, and the camera moves along x."""
-        camera = torch.zeros(1, 4, 4)
-        camera[0, 0, 0], camera[0, 1, 1], camera[0, 3, 3] = 2 / WIDTH, 2 / HEIGHT, 1.0
-        camera[0, 3, 0], camera[0, 3, 1] = -1 - 2 * shift / WIDTH, -1.0
-        position = torch.stack([xs + 0.5 + shift, ys + 0.5, torch.full_like(xs, 3.0, dtype=torch.float32)])[None]
-        return position, camera
-
-    moved = torch.zeros(1, 2, HEIGHT, WIDTH)
-    moved[:, 0] = 2
-    results = []
-    for positions in (False, True):
-        model, state = Svgf(), None
-        for number, shift in enumerate((0.0, 2.0)):
-            position, camera = view(shift)
-            given = frame(seed=number, position=position, view_projection=camera, motion=moved * number)
-            if positions:
-                given = given.replace(motion=None)
-            output, state = model(given, state)
-        results.append((output.image, kept(state)[2]))
-    torch.testing.assert_close(results[0][0], results[1][0], rtol=1e-3, atol=1e-3)
-    # The pixels that came into view at the right have no history, and the corner moves over the wall.
-    assert results[0][1][..., -2:].unique().tolist() == [1.0]
-    assert results[0][1][..., :10].unique().tolist() == [2.0]
-
-
 def test_a_frame_without_motion_has_no_history() -> None:
     denoiser = Denoiser("svgf")
     for seed in (0, 1):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Any
 
 import pytest
 import torch
-from toys import frame_of
+from toys import frame_of, has_oidn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, start_with
@@ -17,9 +16,6 @@ from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.ops._steps.transfer import compress, expand
 
 SIZE = (32, 64)
-has_oidn = pytest.mark.skipif(
-    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
-)
 
 
 def given(length: float) -> Frame:

@@ -1,8 +1,10 @@
 """Methods of ten lines that know nothing of their wrappers, and frames for them."""
 
+import importlib.util
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -14,6 +16,10 @@ from mcdenoise.models._registry import find_model
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.ops._backend import Backend
+
+has_oidn = pytest.mark.skipif(
+    importlib.util.find_spec("pyoidn") is None, reason="Open Image Denoise is in the extra mcdenoise[oidn]"
+)
 
 
 def report_of(output: Output) -> FrameReport:
