@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,11 @@ import numpy as np
 import pytest
 import torch
 from commands import refuses, run
+from pictures import edit
 
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.cli import COMMANDS
-from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.models import list_models
 from mcdenoise.models._weights import pretrained_models
@@ -26,12 +26,6 @@ from mcdenoise.models._weights import pretrained_models
 @pytest.fixture
 def denoise(small_sequence: Path, weights: Path, out: Path) -> list[Any]:
     return ["denoise", small_sequence, "-o", out, "--weights", weights]
-
-
-def edit(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
-    pixels, channels, _ = read_exr(path)
-    change(pixels)
-    write_exr(path, pixels, channels, full_float=True)
 
 
 def whole_images(folder: Path) -> list[str]:

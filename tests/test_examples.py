@@ -76,12 +76,6 @@ def test_composed_denoiser_improves_on_its_input(small_sequence: Path) -> None:
         assert composed[1] > accumulated[1] > noisy[1]
 
 
-def test_composed_denoiser_is_a_method_of_every_command(small_sequence: Path, tmp_path: Path) -> None:
-    method = EXAMPLES / "compose_denoiser.py"
-    succeeds(f"denoise {small_sequence} -o {tmp_path}/out --model {method}:method")
-    assert json.loads((tmp_path / "out" / "denoise.json").read_text())["model"] == "compose_denoiser.py:method"
-
-
 def test_a_method_composed_of_two_learns(small_sequence: Path) -> None:
     lines = run("compose_zoo.py", small_sequence, "--steps", "60", "--crop", "16").splitlines()
     assert [line.split()[0] for line in lines] == ["noisy", "accumulated", "untrained", "trained"]

@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from refusals import refused
+from test_docs import DOCS, blocks
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError
@@ -99,9 +99,8 @@ def smape(image: Array, reference: Array) -> float:
 
 def test_the_example_of_the_page_runs(mi: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    text = (Path(__file__).resolve().parents[1] / "docs" / "mitsuba.md").read_text(encoding="utf-8")
-    assert len(text.split()) <= 600
-    (code,) = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert len((DOCS / "mitsuba.md").read_text(encoding="utf-8").split()) <= 600
+    (code,) = blocks("mitsuba.md", "python")
     exec(compile(code, "mitsuba.md", "exec"), {"__name__": "page"})
     clean = np.array(mi.Bitmap("clean.exr"))
     assert clean.shape == (HEIGHT, WIDTH, 3)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refuses, succeeds
+from pictures import frames_of
 
 from mcdenoise.data import read_exr
 from mcdenoise.data.png import Picture, read_png
@@ -23,12 +24,6 @@ def code(radiance: float) -> int:
 
 def shown(folder: Path, name: str) -> Picture:
     return read_png(folder / "preview" / f"{name}.png")
-
-
-def frames_of(path: Path) -> list[Picture]:
-    av = pytest.importorskip("av")
-    with av.open(path) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 @pytest.mark.parametrize("stops", [-3.0, 0.0, 1.5])

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from commands import run, succeeds
+from test_docs import blocks
 
 from mcdenoise.check.cases import OPS
 from mcdenoise.data import read_exr
@@ -19,8 +20,7 @@ RESEARCHERS = ROOT / "docs" / "for-researchers.md"
 def code_with(page: Path, part: str) -> dict:
     """Return the names that the block of a page that contains ``part`` defines when it is run."""
     namespace: dict = {}
-    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    exec(next(block for block in blocks if part in block), namespace)
+    exec(next(block for block in blocks(page, "python") if part in block), namespace)
     return namespace
 
 
@@ -67,8 +67,7 @@ def test_the_composed_example_is_exported_and_stable(tmp_path: Path, monkeypatch
 
 
 def write_composed(folder: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", RESEARCHERS.read_text(encoding="utf-8"), re.DOTALL)
-    block = next(block for block in blocks if "def network" in block)
+    block = next(block for block in blocks(RESEARCHERS, "python") if "def network" in block)
     (folder / "mine.py").write_text(block.partition("\ndenoiser = ")[0])
 
 

@@ -52,20 +52,15 @@ def test_write_text_is_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         write_text(tmp_path / "missing" / "a.txt", "x")
 
-    def interrupted() -> None:
+    def broken_off(error: BaseException) -> None:
         with atomic_path(tmp_path / "a.txt") as temporary:
             temporary.write_text("half of i")
-            raise KeyboardInterrupt
-
-    def full() -> None:
-        with atomic_path(tmp_path / "a.txt") as temporary:
-            temporary.write_text("half of i")
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise error
 
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
+        broken_off(KeyboardInterrupt())
     with pytest.raises(InputError, match="No space left"):
-        full()
+        broken_off(OSError(errno.ENOSPC, "No space left on device"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "eins, zwei, dreißig"
 

@@ -13,7 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from damage import DAMAGES, Generator, assert_clear, attribute, outcomes
-from pictures import save
+from pictures import part_of, save
 
 RENDERERS = Path(__file__).with_name("renderers")
 COMPRESSIONS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB", "HTJ2K256", "HTJ2K32")
@@ -33,14 +33,8 @@ def layers(kind: type = np.float16) -> dict[str, np.ndarray]:
 
 
 def write_exr(path: Path, *parts: dict[str, np.ndarray], compression: str = "ZIP", **header: object) -> None:
-    made = [
-        OpenEXR.Part(
-            {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage, **header},
-            channels,
-            **({"name": f"part{i}"} if len(parts) > 1 else {}),
-        )
-        for i, channels in enumerate(parts)
-    ]
+    header["compression"] = getattr(OpenEXR, f"{compression}_COMPRESSION")
+    made = [part_of(each, f"part{i}" if len(parts) > 1 else "", **header) for i, each in enumerate(parts)]
     OpenEXR.File(made).write(str(path))
 
 

@@ -10,7 +10,7 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 from damage import assert_clear, outcomes_of
-from pictures import save
+from pictures import part_of, save
 from refusals import full_disk
 
 from mcdenoise.cli.inspect import print_sequence
@@ -25,20 +25,14 @@ NAMES = (
 )
 
 
-def window(top: int, left: int, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([left, top], np.int32), np.array([left + size[1] - 1, top + size[0] - 1], np.int32)
-
-
-def pixels(size: tuple[int, int] = SIZE, kind: type = np.float16) -> np.ndarray:
-    values = np.random.default_rng(0).random(size)
+def pixels(kind: type = np.float16) -> np.ndarray:
+    values = np.random.default_rng(0).random(SIZE)
     return (values * 4e9).astype(kind) if kind is np.uint32 else values.astype(kind)
 
 
-def part(channels: object, name: str = "", size: tuple[int, int] = SIZE, **header: object) -> OpenEXR.Part:
-    made = channels if isinstance(channels, dict) else {each: pixels(size) for each in channels}
-    windows = {"displayWindow": window(0, 0), "dataWindow": window(0, 0, size)}
-    kind = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.scanlineimage}
-    return OpenEXR.Part(windows | kind | header, made, *([name] if name else []))
+def part(channels: object, name: str = "", **header: object) -> OpenEXR.Part:
+    made = channels if isinstance(channels, dict) else {each: pixels() for each in channels}
+    return part_of(made, name, **header)
 
 
 def write(path: Path, *parts: OpenEXR.Part) -> Path:
@@ -158,8 +152,7 @@ def test_any_values_are_read_and_written_without_a_warning(tmp_path: Path, seed:
                 where = g.random(size) < amount
                 values[where] = g.choice(chosen, int(where.sum()))
                 channels[f"View.{name}.{letter}"] = values
-        windows = {"displayWindow": window(0, 0, size)}
-        write(tmp_path / f"shot{number}.exr", part(channels, size=size, **windows))
+        write(tmp_path / f"shot{number}.exr", part(channels))
     sequence = open_sequence(tmp_path)
     (tmp_path / "out").mkdir()
     for number in sequence.numbers:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import frames_of
 from refusals import full_disk, refused
 
 from mcdenoise.data.png import Picture
@@ -12,12 +13,6 @@ from mcdenoise.data.video import write_video
 from mcdenoise.errors import InputError
 
 av = pytest.importorskip("av")
-
-
-def decode(path: Path) -> list[Picture]:
-    """The frames of a video, by what its file says of their colours."""
-    with av.open(path) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 def gradient(height: int, width: int, blue: int = 60) -> Picture:
@@ -31,7 +26,7 @@ def gradient(height: int, width: int, blue: int = 60) -> Picture:
 def test_every_picture_is_a_frame(tmp_path: Path, count: int) -> None:
     pictures = [gradient(48, 64, 20 * number) for number in range(count)]
     write_video(tmp_path / "a.mp4", iter(pictures), 12.5)
-    frames = decode(tmp_path / "a.mp4")
+    frames = frames_of(tmp_path / "a.mp4")
     assert len(frames) == count
     for picture, frame in zip(pictures, frames, strict=True):
         # A wrong matrix or range, or a neighbour in its place, is off by 6 codes and more.

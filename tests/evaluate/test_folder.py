@@ -3,15 +3,15 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from pictures import edit
 
-from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data import open_sequence
 from mcdenoise.data.files import json_text
 from mcdenoise.errors import InputError
 from mcdenoise.evaluate import METRICS, USUAL, evaluate_folder, find_images, measure
@@ -33,12 +33,6 @@ def images(small_sequence: Path, tmp_path: Path) -> Path:
     for number in range(4):
         shutil.copy(small_sequence / "inputs" / f"color{number}.exr", out / f"denoised{number}.exr")
     return out
-
-
-def changed(path: Path, change: Callable[[np.ndarray[Any, Any]], object]) -> None:
-    pixels, channels, _ = read_exr(path)
-    change(pixels)
-    write_exr(path, pixels, channels, full_float=True)
 
 
 @pytest.mark.parametrize(
@@ -178,6 +172,6 @@ def test_pixels_that_are_not_finite_are_counted(small_sequence: Path, images: Pa
         pixels[5, 7, 1] = np.nan
         pixels[6, 2] = np.inf
 
-    changed(images / "denoised2.exr", spoil)
+    edit(images / "denoised2.exr", spoil)
     with pytest.raises(InputError, match=r"denoised2.exr: .*2 .* of 480, .* row 5, column 7"):
         evaluate_folder(open_sequence(small_sequence), images)

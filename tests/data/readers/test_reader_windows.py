@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 import pytest
-from pictures import stored
+from pictures import part_of, stored
 
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence
@@ -15,18 +15,6 @@ from mcdenoise.folder import denoise_sequence
 
 Image = np.ndarray[Any, Any]
 DISPLAY = (40, 64)
-
-
-def part(channels: dict[str, Image], top: int, left: int, name: str = "", display: tuple[int, int] = DISPLAY) -> Any:
-    height, width = next(iter(channels.values())).shape
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "dataWindow": (np.int32([left, top]), np.int32([left + width - 1, top + height - 1])),
-        "displayWindow": (np.int32([0, 0]), np.int32([display[1] - 1, display[0] - 1])),
-        **({"name": name} if name else {}),
-    }
-    return OpenEXR.Part(header, {key: np.ascontiguousarray(value) for key, value in channels.items()}, name)
 
 
 def radiance(height: int, width: int, seed: int) -> dict[str, Image]:
@@ -43,7 +31,9 @@ def cropped(tmp_path: Path) -> Path:
     (tmp_path / "in").mkdir()
     for number, (top, left, height, width) in enumerate(WINDOWS):
         channels = radiance(height, width, number) | {"Z": np.full((height, width), 2 + number, np.float32)}
-        OpenEXR.File([part(channels, top, left)]).write(str(tmp_path / f"in/shot_{number:04d}.exr"))
+        OpenEXR.File([part_of(channels, place=(top, left), display=DISPLAY)]).write(
+            str(tmp_path / f"in/shot_{number:04d}.exr")
+        )
     return tmp_path / "in"
 
 
@@ -78,7 +68,8 @@ def test_each_file_is_written_in_its_own_window(cropped: Path, tmp_path: Path, o
 def test_a_cropped_feature_is_placed_where_it_belongs(tmp_path: Path) -> None:
     albedo = {f"albedo.{name}": np.full((10, 12), 0.25, np.float32) for name in "RGB"}
     path = tmp_path / "shot.exr"
-    OpenEXR.File([part(radiance(*DISPLAY, 0), 0, 0, "rgba"), part(albedo, 8, 20, "albedo")]).write(str(path))
+    cropped = part_of(albedo, "albedo", place=(8, 20), display=DISPLAY)
+    OpenEXR.File([part_of(radiance(*DISPLAY, 0), "rgba"), cropped]).write(str(path))
     sequence = open_sequence(path)
     frame = sequence.frame(sequence.numbers[0])
     expected = np.zeros(DISPLAY, np.float32)
@@ -92,7 +83,8 @@ def test_a_cropped_feature_is_placed_where_it_belongs(tmp_path: Path) -> None:
 
 
 def test_another_display_window_is_refused(cropped: Path) -> None:
-    other = part(radiance(20, 30, 0) | {"Z": np.ones((20, 30), np.float32)}, 4, 6, display=(80, 128))
+    channels = radiance(20, 30, 0) | {"Z": np.ones((20, 30), np.float32)}
+    other = part_of(channels, place=(4, 6), display=(80, 128))
     OpenEXR.File([other]).write(str(cropped / "shot_0001.exr"))
     with pytest.raises(InputError, match=r"shot_0001\.exr"):
         open_sequence(cropped)
