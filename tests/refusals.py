@@ -1,8 +1,10 @@
 """What is refused, and in which words: one line, and nothing of Python's own."""
 
+import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,3 +31,17 @@ def full_disk(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def put_no_file(what: str, path: Path) -> None:
+    """Put something that is no file of sensible size at a path."""
+    path.unlink(missing_ok=True)
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what in ("empty", "huge"):
+        path.touch()
+        os.truncate(path, 1 << 42 if what == "huge" else 0)
+    elif what != "nothing":
+        path.symlink_to({"device": "/dev/zero", "terminal": "/dev/ptmx", "link": "nothing", "loop": path.name}[what])

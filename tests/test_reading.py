@@ -1,13 +1,12 @@
 """Files that people name, or that lie where one looks for them: whatever they are, nothing waits for ever."""
 
 import functools
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from refusals import refused
+from refusals import put_no_file, refused
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.camera_matrices import read_camera_matrices
@@ -36,20 +35,6 @@ READERS: dict[str, Callable[[Path], object]] = {
 NO_FILES = ["pipe", "device", "terminal", "folder", "link", "loop", "huge"]
 
 
-def put(what: str, path: Path) -> None:
-    """Put something that is no file of sensible size at a path."""
-    path.unlink(missing_ok=True)
-    if what == "pipe":
-        os.mkfifo(path)
-    elif what == "folder":
-        path.mkdir()
-    elif what == "huge":
-        path.touch()
-        os.truncate(path, 1 << 42)
-    else:
-        path.symlink_to({"device": "/dev/zero", "terminal": "/dev/ptmx", "link": "nothing", "loop": path.name}[what])
-
-
 def check_refused(action: Callable[[], object], path: Path) -> None:
     message = refused(action)
     assert str(path) in message
@@ -60,7 +45,7 @@ def check_refused(action: Callable[[], object], path: Path) -> None:
 @pytest.mark.parametrize("name", READERS)
 def test_paths_that_are_no_files_are_refused_in_one_line(name: str, what: str, tmp_path: Path) -> None:
     path = tmp_path / name
-    put(what, path)
+    put_no_file(what, path)
     check_refused(functools.partial(READERS[name], path), path)
 
 
@@ -69,7 +54,7 @@ def test_paths_that_are_no_files_are_refused_in_one_line(name: str, what: str, t
 @pytest.mark.parametrize("name", ["camera_matrices.h", "camera.json"])
 def test_paths_in_a_sequence_that_are_no_files_are_refused(name: str, what: str, small_sequence: Path) -> None:
     path = small_sequence / "inputs" / name
-    put(what, path)
+    put_no_file(what, path)
     check_refused(lambda: open_sequence(small_sequence), path)
 
 

@@ -1,12 +1,12 @@
 """Damage to files, by seed, and replacements of files."""
 
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from data.damage import flipped, flipped_header, noise, spliced, truncated
+from refusals import put_no_file
 
 Generator = np.random.Generator
 
@@ -44,35 +44,13 @@ DAMAGES: tuple[Callable[[Generator, bytes], bytes], ...] = (
 )
 
 
-def put_folder(path: Path) -> None:
-    path.mkdir()
+def put(what: str) -> Callable[[Path], None]:
+    def at(path: Path) -> None:
+        put_no_file(what, path)
 
-
-def put_pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def put_dangling(path: Path) -> None:
-    path.symlink_to("nothing")
-
-
-def put_loop(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def put_endless(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def put_empty(path: Path) -> None:
-    path.touch()
-
-
-def put_nothing(path: Path) -> None:
-    assert not path.exists()
+    at.__name__ = f"put_{what}"
+    return at
 
 
 # Replacements of a file; they do not depend on a seed.
-PLACES: tuple[Callable[[Path], None], ...] = (
-    *(put_folder, put_pipe, put_dangling, put_loop, put_endless, put_empty, put_nothing),
-)
+PLACES = tuple(map(put, ("folder", "pipe", "link", "loop", "device", "empty", "nothing")))
