@@ -4,12 +4,11 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from commands import succeeds
 from planes import plane
 
-from mcdenoise import Denoiser, InputError, denoise
+from mcdenoise import Denoiser, denoise
 from mcdenoise.data import open_sequence
 from mcdenoise.folder import denoised_frames
 from mcdenoise.models import DEFAULT
@@ -25,8 +24,6 @@ def test_a_denoiser_without_a_name_is_the_default(small_sequence: Path, weights:
     assert any(isinstance(each, WildNetwork) for each in Denoiser(alpha_min=0.5, tolerance=0).model.modules())
     # Weights say which model they are for.
     assert not any(isinstance(each, WildNetwork) for each in Denoiser(weights=weights).model.modules())
-    with pytest.raises(InputError, match="tile, max_memory: "):
-        Denoiser(tile=64, max_memory=2.0)
 
 
 def test_a_still_in_python() -> None:
