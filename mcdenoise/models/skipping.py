@@ -172,7 +172,8 @@ class Skipping(Wrapper):
         if not calm.any():
             return calm, None
         marks = _marks(frame)
-        if before.marks is None:
+        # They differ in shape where the frame before had other features.
+        if before.marks is None or marks.shape != before.marks.shape:
             return torch.zeros_like(calm), marks
         same = (marks == before.marks).all(1, keepdim=True).all(0, keepdim=True)
         changed = ~(same & (_change(frame.color, weight, before.color, before.weight, TILE) <= limit))

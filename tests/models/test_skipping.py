@@ -249,6 +249,17 @@ def test_only_edited_parts_are_computed_again() -> None:
     assert max(errors) < 1e-3
 
 
+def test_everything_is_computed_again_where_a_feature_comes_or_goes() -> None:
+    denoiser = Denoiser(small("wild_small"))
+    frame = wall(0, 0.2, (64, 96))
+    for _ in range(17):
+        denoiser(frame)
+    assert stage(denoiser, "unchanged tiles").skipped == 1
+    for other in (frame.replace(normal=None), frame):
+        denoiser(other)
+        assert stage(denoiser, "unchanged tiles").skipped == 0
+
+
 def test_a_tile_does_not_switch_to_and_fro() -> None:
     """The noise of every tile hovers about the tolerance: it leaves once, and comes back never."""
     noise, frames, alpha_min = 0.02, 60, 0.1
