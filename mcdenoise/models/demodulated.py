@@ -22,7 +22,7 @@ class Demodulated(Wrapper):
     """Divides the radiance by the albedo, and multiplies every image of the result by it.
 
     This is skipped for a frame without an albedo, and if the divisor of :func:`mcdenoise.ops.demodulate` is one in
-    every pixel.
+    every pixel and no derivative in the albedo is asked for.
 
     Args:
         inner: any method. Its frame has demodulated radiance: the color, the color of the current frame, diffuse
@@ -79,7 +79,8 @@ def _why_not(albedo: Tensor | None) -> str:
     """Reason for skipping the demodulation; empty if it is needed."""
     if albedo is None:
         return "no albedo"
-    if not at_hand(albedo.device):
+    # The derivative in an albedo of one is not zero: it is also divided by.
+    if not at_hand(albedo.device) or (albedo.requires_grad and torch.is_grad_enabled()):
         return ""
     low, high = (float(value) for value in torch.aminmax(albedo.detach()))
     return "albedo is one everywhere" if low == high == 1 else "no albedo anywhere" if high < NO_ALBEDO else ""

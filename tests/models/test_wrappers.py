@@ -156,6 +156,16 @@ def test_where_there_is_nothing_to_divide_out_nothing_is_done(albedo: float | No
         torch.testing.assert_close(output.image, frame.color, rtol=0, atol=0)
 
 
+def test_the_derivative_in_an_albedo_of_one_is_that_beside_it() -> None:
+    slopes = []
+    for number in (1.0, 1 - 1e-6):
+        frame = frame_of(9, 7)
+        albedo = torch.full((1, 3, 9, 7), number, requires_grad=True)
+        image = Demodulated(Blur())(frame.replace(albedo=albedo))[0].image
+        slopes += torch.autograd.grad((image * frame.color).sum(), albedo)
+    torch.testing.assert_close(*slopes, rtol=1e-4, atol=1e-4)
+
+
 def test_a_result_of_half_precision_is_remodulated_in_that_of_the_albedo() -> None:
     frame = frame_of(9, 7)
     assert Demodulated(lambda color: color.bfloat16())(frame)[0].image.dtype == torch.float32
