@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -219,15 +218,14 @@ class Frame:
                 f"{near and '; '}{near}"
             )
         color, valid = unmasked(color, layout)
-        if valid is not None:
-            given_mask = buffers.get("mask")
-            other = valid if given_mask is None else np.asarray(given_mask, np.float32).reshape(valid.shape)
-            buffers["mask"] = np.minimum(valid, other)
         image = of_array("color", color, layout, None)
         size = (image.shape[2], image.shape[3])
         given: dict[str, Any] = {
             name: of_array(name, value, layout, size) for name, value in buffers.items() if value is not None
         }
+        if valid is not None:
+            own = of_array("mask", valid, layout, size)
+            given["mask"] = torch.minimum(own, given.get("mask", own))
         for name in extra or {}:
             if name in _NAMES:
                 raise InputError(f"extra: expected names that Frame does not know, found '{name}'; pass {name}=...")

@@ -187,6 +187,10 @@ def test_the_mask_of_an_array_is_the_buffer() -> None:
     np.testing.assert_allclose(mcdenoise.denoise(np.ma.masked_invalid(color[..., 0]), model=blur), image[..., 0])
     assert "masked" in refused(lambda: Frame.from_numpy(color, depth=np.ma.masked_invalid(color[..., 0])))
     assert Frame.from_numpy(np.ma.masked_array(np.ones((4, 5, 3)))).mask.all()
+    rows = np.repeat(np.float32([[1], [0], [1]]), 2, 1)
+    both = Frame.from_numpy(np.ma.masked_equal(np.float32([[3, 1]] * 3), 3), mask=rows).mask
+    assert both.tolist() == [[[[0, 1], [0, 0], [0, 1]]]]
+    assert "(2, 3)" in refused(lambda: Frame.from_numpy(np.ma.masked_equal(np.ones((3, 2)), 3), mask=rows.T))
 
 
 @pytest.mark.parametrize("layout", ["HWC", "CHW"])
