@@ -28,6 +28,9 @@ REST = "(rest)"
 _FALLOFFS, _COARSE = (10.0, 10.0, 1000.0, 20.0), 0.75
 # Relative rounding error of a sum of half-precision layers. A smaller remainder is no layer of its own.
 _ROUNDING, _SMALLEST_HALF = 2.0**-9, 2.0**-24
+# What is darker than this fraction of the light of the image, or than this number, is black: it is what a filter with
+# tiny weights leaves of its distant neighbours, and a derivative that is divided by it would overflow.
+_BLACK, _LEAST = 1e-20, 1e-37
 # Layers that are together brighter than the color by more than this fraction of all light are not its parts.
 _MOST_EXCESS = 0.02
 
@@ -111,7 +114,7 @@ def split(image: Tensor, parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     total = functools.reduce(torch.add, positive.values())
     means = {name: part.mean((2, 3), keepdim=True) for name, part in positive.items()}
     all_light = functools.reduce(torch.add, means.values())
-    some, any_light = total > 0, all_light > 0
+    some, any_light = total > (_BLACK * all_light).clamp_min(_LEAST), all_light > 0
     total, all_light = torch.where(some, total, 1), torch.where(any_light, all_light, 1)
     equal = len(parts) - (REST in parts)
     proportions = {

@@ -93,6 +93,15 @@ def test_layers_sum_to_the_image_in_float64_and_have_derivatives(name: str) -> N
         assert bool(gradient.any()) is not (name in HISTORY_OF_IMAGES and frame is second)
 
 
+@pytest.mark.parametrize("leak", [1e-21, 1e-30, 1e-40])
+def test_what_a_filter_leaves_of_distant_light_has_derivatives(leak: float) -> None:
+    part = torch.tensor([1.0, leak]).repeat(1, 3, 1, 1).requires_grad_()
+    layers = split(torch.ones_like(part), {"diffuse": part, "glossy": 3 * part.detach()})
+    assert torch.equal(layers["diffuse"], torch.full_like(part, 0.25))
+    (slope,) = torch.autograd.grad(layers["diffuse"].square().sum(), part)
+    assert torch.isfinite(slope).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @torch.no_grad()
