@@ -133,18 +133,19 @@ def reproject(
     """
     here, there = comparable(surface, previous_surface)
     test = _bmfr_test if rule == "bmfr" else _relative_test
+    dtype = torch.promote_types(previous.dtype, torch.float32)
+    there = Surface(*(None if buffer is None else buffer.to(dtype) for buffer in there))
     if motion is None:
         kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & test(here, there, position_limit, normal_limit)
         return torch.where(kept, previous, 0), kept.to(previous.dtype)
     height, width = previous.shape[-2:]
-    dtype = torch.promote_types(previous.dtype, torch.float32)
 
     known, base, fraction = places_before(motion, dtype)
     x0, y0 = base.split(1, 1)
     fx, fy = fraction.split(1, 1)
 
     # For each tap, one gather fetches all buffers to compare, and one all values to sum.
-    tested = [buffer.to(dtype) for buffer in there if buffer is not None]
+    tested = [buffer for buffer in there if buffer is not None]
     stack = torch.cat(tested, 1).flatten(2) if tested else None
     taps: list[tuple[Tensor, Tensor, Tensor]] = []
     alike = []

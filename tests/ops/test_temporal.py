@@ -126,6 +126,15 @@ def test_no_motion_is_one_of_zeros_to_the_last_bit() -> None:
     assert results[1].unique().tolist() == [0, 1]
 
 
+def test_surfaces_of_half_precision_are_compared_alike_with_and_without_motion() -> None:
+    previous, here, there = (draw(1, 3, 80, 80, seed=seed).half() for seed in range(3))
+    # Their squared distance is half on average, which is the limit.
+    surfaces = Surface(normal=here), Surface(normal=there)
+    expected = reproject(previous, still(80, 80).half(), *surfaces)
+    assert expected[1].unique().tolist() == [0, 1]
+    assert all(map(torch.equal, reproject(previous, None, *surfaces), expected))
+
+
 def test_motion_keeps_its_precision_under_autocast() -> None:
     """The scene is 100 units from the origin, where bfloat16 would be off by 64 pixels."""
     position = 100 + torch.rand(1, 3, 36, 64)
