@@ -377,7 +377,8 @@ class Denoiser:
 
             # A GPU tells it when the next frame comes.
             report.ask(noise_of(frame.color, frame.albedo, frame.normal).level, hear)
-            if not self._rounds:
+            # A GPU told it of the frame before, and before the first one of a shot there is none.
+            if not self._rounds or not (self._count or at_hand(self.device)):
                 # Less memory than float32 needs may have been allowed.
                 with suppress(InputError):
                     tiles = self._tiles.divide(shot)

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from reads import without_reads
 
-from mcdenoise import Denoiser, Frame, InputError, denoise
+from mcdenoise import Denoiser, Frame, InputError, denoise, ops
 from mcdenoise.models import _precision
 from mcdenoise.models._precision import ENVIRONMENT, _machine, _measured, fastest_precision
 
@@ -149,6 +150,15 @@ def test_the_report_says_why_and_the_image_is_that_of_the_precision(measured: li
     assert asked.report.precision == "asked for"
     array = denoise(frame.color[0].numpy(), layout="CHW", model="wild_small")
     assert torch.equal(torch.from_numpy(array), image[0])
+
+
+def test_without_reads_a_shot_begins_in_float32_whatever_came_before() -> None:
+    denoiser, frame = Denoiser("wild_small", precision="bfloat16"), Frame(color=torch.rand(1, 3, 24, 32))
+    with ops.use("torch"), without_reads():
+        first = denoiser(frame)
+        assert not torch.equal(denoiser(frame), first)
+        denoiser.reset()
+        assert torch.equal(denoiser(frame), first)
 
 
 @pytest.mark.parametrize("name", ["wild", "wild_small"])
