@@ -91,7 +91,8 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
         frame: with the normals and depths of these pixels.
     """
     few = moments_variance(moments, frame.normal, frame.depth, kernel_size=WINDOW) * (_FEW_FRAMES / length)
-    return torch.where(length < _FEW_FRAMES, few, moments_variance(moments))
+    # Not at a limit: a reprojected length of four may be just below it.
+    return torch.lerp(moments_variance(moments), few, (_FEW_FRAMES - length).clamp(0, 1))
 
 
 @register_model("svgf", kind="filter", paper="Schied et al. 2017")
