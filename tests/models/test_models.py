@@ -598,7 +598,7 @@ def test_compared_weights_have_equal_training_settings() -> None:
     own = {"model", "settings", "loss", "temporal_weight"}
     # The page of the zoo says which are of the present recipe.
     present = {name for name, each in about.items() if json.loads(each["config"])["crop"] == 128}
-    assert present == {"cascaded", "kp", "kpcn"}
+    assert present == {"cascaded", "kp", "kpcn", "mrkp"}
     for names in (present - {"cascaded"}, set(about) - present):
         configs = [json.loads(about[name]["config"]) for name in names]
         assert len({json.dumps({k: v for k, v in each.items() if k not in own}) for each in configs}) == 1
