@@ -10,6 +10,7 @@ processor. The others get the same, since it sees nothing that depends on their 
 """
 
 import argparse
+import copy
 import itertools
 import json
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from train import Tiles, by_level, framed, rate_of
+from train import Tiles, by_level, rate_of
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
@@ -39,13 +40,12 @@ def tried(model: nn.Module, trust: Trust, tiles: Tiles) -> tuple[Tensor, Tensor,
     """What ``trust`` sees of each shot, the errors of the nine choices in its blocks, and how often it is drawn."""
     seen, found, rows = list[Tensor](), list[Tensor](), list[tuple[int, float]]()
     handle = trust.layers.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+    first = copy.deepcopy(trust.state_dict())
     trust.last.weight.zero_()
     for take in (take for take in tiles.takes if take["frames"] > 1):
         for history in range(take["histories"]):
-            fixed, begun = (take[name] + take["frames"] - 1 for name in ("first", "begun"))
-            frame, reference = framed(
-                tiles.fixed[fixed, None].float(), tiles.history[begun + history * take["frames"], None].float()
-            )
+            frames, references = tiles.frames(take, history)
+            frame, reference = frames.map(lambda image: image[-1:]), references[-1:]
             scale, errors = oidn_exposure(reference), list[Tensor]()
             for logits in itertools.product(LOGITS, repeat=2):
                 trust.last.bias.copy_(torch.tensor(logits) / _PACE)
@@ -58,6 +58,7 @@ def tried(model: nn.Module, trust: Trust, tiles: Tiles) -> tuple[Tensor, Tensor,
             found.append(torch.cat(errors, 1))
             rows.append((take["spp"], YOUNG if history else 1.0))
     handle.remove()
+    trust.load_state_dict(first)
     levels, often = torch.tensor(rows).unbind(1)
     return torch.cat(seen), torch.cat(found), by_level(levels, often)
 
@@ -102,11 +103,6 @@ def _middle(image: Tensor, size: torch.Size) -> Tensor:
     return image[..., top : top + size[0], left : left + size[1]]
 
 
-def _trust_of(model: nn.Module) -> Trust:
-    (trust,) = (part for part in model.modules() if isinstance(part, Trust))
-    return trust
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("packed", type=Path, metavar="FOLDER")
@@ -120,11 +116,9 @@ def main() -> None:
     for spelling in map(parse_method, options.weights):
         about = describe_weights(spelling.weights or find_weights(spelling.model))
         model = create_model(spelling.model, pretrained=spelling.weights is None, weights=spelling.weights).eval()
-        trust = _trust_of(model)
+        (trust,) = (part for part in model.modules() if isinstance(part, Trust))
         if chosen is None:
-            first = {name: weight.clone() for name, weight in trust.state_dict().items()}
             data = tried(split(model)[1], trust, Tiles(options.packed, torch.device("cpu")))
-            trust.load_state_dict(first)
             learn(trust.requires_grad_(), data, options.steps)
             chosen = trust
         trust.load_state_dict(chosen.state_dict())

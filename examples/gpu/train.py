@@ -102,11 +102,11 @@ class Tiles:
         low, high = (torch.from_numpy(part[f"{name}.{byte}"]).to(self.device) for byte in (0, 1))
         return torch.stack([low, high], -1).view(torch.float16)[..., 0]
 
-    def frames(self, take: dict[str, Any]) -> tuple[Frame, Tensor]:
-        """The frames of a tile with the whole history, and their reference."""
-        own = slice(take["first"], take["first"] + take["frames"])
-        begun = slice(take["begun"], take["begun"] + take["frames"])
-        return framed(self.fixed[own].float(), self.history[begun].float())
+    def frames(self, take: dict[str, Any], history: int = 0) -> tuple[Frame, Tensor]:
+        """The frames of a tile with one of its histories, by default the whole one, and their reference."""
+        begun = take["begun"] + history * take["frames"]
+        own, theirs = (slice(start, start + take["frames"]) for start in (take["first"], begun))
+        return framed(self.fixed[own].float(), self.history[theirs].float())
 
     def draw(self, config: TrainConfig, clips: int) -> tuple[Frame, Tensor]:
         """Draw single frames as a batch, and their references."""

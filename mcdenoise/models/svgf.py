@@ -4,7 +4,8 @@ Schied et al. 2017, "Spatiotemporal Variance-Guided Filtering: Real-Time Reconst
 Illumination", High Performance Graphics. The paper leaves open the epsilons of its edge-stopping functions (see
 :func:`mcdenoise.ops.atrous`), the test of surfaces (here that of :func:`mcdenoise.ops.reproject`), and how a history
 begins (here with an average, ``alpha = 1 / n`` until that is less than ``alpha``). As in the authors' published code,
-but not in the paper, the spatial estimate of the variance is multiplied by ``4 / n`` for a history of ``n`` frames.
+but not in the paper, the spatial estimate of the variance is multiplied by ``4 / n`` for a history of ``n`` frames. It
+fades into the temporal one between three and four frames, as bilinear taps blend histories of several lengths.
 Direct and indirect light are not separated here, and there is no antialiasing afterwards.
 """
 
@@ -91,7 +92,6 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
         frame: with the normals and depths of these pixels.
     """
     few = moments_variance(moments, frame.normal, frame.depth, kernel_size=WINDOW) * (_FEW_FRAMES / length)
-    # Not at a limit: a reprojected length of four may be just below it.
     return torch.lerp(moments_variance(moments), few, (_FEW_FRAMES - length).clamp(0, 1))
 
 

@@ -150,7 +150,17 @@ def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(name: str, here
 
 
 MODULES = [
-    *("numpy", "torch", "mitsuba", "drjit", "typing", "socket", "pickle", "json", "random", "multiprocessing", "bpy"),
+    "numpy",
+    "torch",
+    "mitsuba",
+    "drjit",
+    "typing",
+    "socket",
+    "pickle",
+    "json",
+    "random",
+    "multiprocessing",
+    "bpy",
 ]
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
 from mcdenoise.models._history import Past
-from mcdenoise.models.svgf import Svgf
+from mcdenoise.models.svgf import Svgf, variance_of
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
 
 HEIGHT, WIDTH = 24, 40
@@ -71,6 +71,13 @@ def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None
         assert image.var() < 0.2 * noise.color.var()
     for image in images[3:]:
         torch.testing.assert_close(image, noise.color, rtol=1e-3, atol=1e-3)
+
+
+def test_rounding_of_the_length_hardly_changes_the_variance() -> None:
+    given, length = frame(), torch.full((1, 1, HEIGHT, WIDTH), 4.0)
+    moments = torch.cat([0.5 * torch.ones_like(length), torch.rand(1, 1, HEIGHT, WIDTH) + 0.25], 1)
+    exact, rounded = (variance_of(moments, each, given) for each in (length, length - 4e-7))
+    torch.testing.assert_close(rounded, exact, rtol=1e-4, atol=1e-6)
 
 
 def test_a_frame_without_motion_has_no_history() -> None:
