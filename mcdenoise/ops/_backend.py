@@ -86,14 +86,22 @@ def _obstacle(tensors: Sequence[Tensor], backends: Sequence[Backend]) -> str:
     """Why numba cannot run on these tensors; empty if it can."""
     if "numba" not in backends:
         return "has no form of this op"
-    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+    if is_transformed():
         return "has no rule for torch.func, vmap or forward mode"
+    # As in make_fx and with fake tensors: a graph would contain one result as a constant.
+    if torch._C._is_tracing() or torch._C._len_torch_dispatch_stack() > 0:
+        return "is seen by no tracing and by no dispatch mode"
     for tensor in tensors:
         if tensor.device.type != "cpu":
             return f"runs on the CPU, not on {tensor.device}"
         if tensor.requires_grad and torch.is_grad_enabled():
             return "has no derivatives of this op"
     return _missing()
+
+
+def is_transformed() -> bool:
+    """Whether a transform of ``torch.func``, or forward mode, needs a rule for every operation, even without grad."""
+    return torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
 @functools.cache

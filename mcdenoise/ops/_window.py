@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Literal
 
@@ -21,7 +22,8 @@ def check_border(border: str) -> None:
 
 def kernel_size_of(taps: int, name: str) -> int:
     """The odd ``K`` of ``taps = K * K``; ``ValueError`` for any other number of taps."""
-    size: int = round(taps**0.5)
+    # While torch traces, a size is a tensor, which has no root.
+    size = math.isqrt(taps)
     if size * size != taps or size % 2 == 0:
         raise ValueError(f"{name}: expected K*K channels with odd K (1, 9, 25, 49, ...), found {taps}")
     return size

@@ -10,6 +10,7 @@ import pytest
 import torch
 from reference_cases import FAST, LAYOUTS, TOLERANCE, assert_same, by, outcomes
 from torch import Generator, Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from mcdenoise import ops
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
@@ -223,6 +224,15 @@ def test_a_graph_needs_no_numba() -> None:
     program = by("numba", torch.export.export)(_Filter(), arguments)
     assert "mcdenoise" not in str(program.graph)
     torch.testing.assert_close(program.module()(*arguments), by("torch", _Filter())(*arguments))
+
+
+# The warnings are torch's own, about sizes that become constants.
+@pytest.mark.filterwarnings("ignore:.*jit.*:DeprecationWarning", "ignore::torch.jit.TracerWarning")
+@pytest.mark.parametrize("trace", [lambda f, x: make_fx(f)(*x), torch.jit.trace], ids=["make_fx", "jit"])
+def test_what_is_traced_is_plain_torch(trace: Callable[..., Any]) -> None:
+    first, second = ((torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96)) for _ in range(2))
+    traced = trace(lambda image, kernel: ops.kernel_conv(image, kernel), first)(*second)
+    torch.testing.assert_close(traced, by("torch", ops.kernel_conv)(*second))
 
 
 ACCUMULATE, REPROJECT = (next(op for op in OPS if op.name == name) for name in ("accumulate", "reproject"))
