@@ -24,7 +24,7 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
         key: radiance to which the typical block is scaled.
 
     Returns:
-        ``(B, 1, 1, 1)`` positive factor; 1 for a black image. The factor has no gradient.
+        ``(B, 1, 1, 1)`` positive, finite factor in the dtype of ``color``; 1 for a black image. It has no gradient.
     """
     # Convert half precision to float32; keep float64.
     luminance = color.detach().to(torch.promote_types(color.dtype, torch.float32)).mean(1, keepdim=True)
@@ -34,7 +34,7 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     # Relative to the mean, so that the logarithms are small at any exposure. Black blocks count as a thousandth of it.
     fractions = (blocks / torch.where(lit, mean, 1)).clamp_min(1e-3)
     typical = (mean * torch.exp(torch.log(fractions).mean((1, 2, 3), keepdim=True))).clamp_min(1e-30)
-    return torch.where(lit, key / typical, 1).to(color.dtype)
+    return torch.where(lit, key / typical, 1).clamp_max(torch.finfo(color.dtype).max).to(color.dtype)
 
 
 def normalize_depth(depth: Tensor) -> Tensor:

@@ -12,6 +12,8 @@ def test_auto_exposure_brings_a_constant_image_to_the_key() -> None:
     color = torch.full((1, 3, 20, 20), 8.0)
     torch.testing.assert_close(auto_exposure(color, key=0.5), torch.full((1, 1, 1, 1), 0.0625))
     assert auto_exposure(torch.zeros(2, 3, 5, 5)).flatten().tolist() == [1, 1]
+    # Half precision holds no larger factor.
+    assert auto_exposure(torch.full((1, 3, 5, 5), 1e-6, dtype=torch.float16)).item() == 65504
 
 
 def test_normalized_depth_written_out() -> None:
