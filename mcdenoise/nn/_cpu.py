@@ -6,7 +6,7 @@ Faster code runs only if no derivative is requested and nothing is being compile
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import cast
 
@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from mcdenoise.ops._backend import is_transformed
 from mcdenoise.ops._window import computing_dtype
 
 
@@ -21,7 +22,7 @@ class ConvBlock(nn.Sequential):
     """Alternating convolutions and ReLUs; each pair runs as one step if no derivative is requested."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return _run(self, x)
+        return _run(list(self), x)
 
 
 class UpConvBlock(ConvBlock):
@@ -34,17 +35,17 @@ class UpConvBlock(ConvBlock):
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:  # type: ignore[override]
         """Convolve ``(B, C, H, W)`` and ``(B, S, 2 H, 2 W)``."""
-        dtype, (first, *others) = computing_dtype(x), self
-        exporting = torch.compiler.is_exporting()
-        if not ((exporting or _is_fused(x, dtype)) and isinstance(first, nn.Conv2d)):
+        dtype, exporting = computing_dtype(x), torch.compiler.is_exporting()
+        if not (_are_pairs(list(self)) and (exporting or _is_fused(x, dtype))):
             return super().forward(torch.cat([F.interpolate(x, scale_factor=2.0), skip.to(x.dtype)], 1))
+        first, others = cast(nn.Conv2d, self[0]), list(self)[1:]
         coarse, fine = first.weight.split([x.shape[1], skip.shape[1]], 1)
         x = F.conv_transpose2d(x.to(dtype), _kernels_of_pixels(coarse).to(dtype), stride=2, padding=1)
         if exporting:
             return _run(others, x + F.conv2d(skip.to(dtype), fine, first.bias, padding=1))
         # The result of a single pixel has another layout, onto which oneDNN adds nothing in bfloat16.
         x = x.contiguous(memory_format=torch.channels_last)
-        return _run(others, _convolved(skip, fine, first.bias, dtype, "relu", onto=x))
+        return _run(others[1:], _convolved(skip, fine, first.bias, dtype, "relu", onto=x))
 
 
 # A pixel contributes to 4 pixels of the finer level along each axis, to each with the sum of these of 3 weights.
@@ -60,16 +61,24 @@ def _kernels_of_pixels(weight: Tensor) -> Tensor:
     return kernels.transpose(0, 1)
 
 
-def _run(layers: Iterable[nn.Module], x: Tensor) -> Tensor:
+def _run(layers: Sequence[nn.Module], x: Tensor) -> Tensor:
     """Alternating convolutions and ReLUs, fused by oneDNN if possible; torch offers this only to its compiler."""
     dtype = computing_dtype(x)
-    fused = _is_fused(x, dtype)
+    fused = _is_fused(x, dtype) and _are_pairs(layers)
     for layer in layers:
         if not fused:
             x = layer(x)
         elif isinstance(layer, nn.Conv2d):
             x = _convolved(x, layer.weight, layer.bias, dtype, "relu")
     return x
+
+
+def _are_pairs(layers: Sequence[nn.Module]) -> bool:
+    """Whether layers are still convolutions and ReLUs in turn, whose calls no hook sees or changes."""
+    # A user may replace activations, normalise weights, or look at features.
+    kinds = [type(layer) for layer in layers]
+    hooked = any(layer._forward_hooks or layer._forward_pre_hooks for layer in layers)
+    return kinds == [nn.Conv2d, nn.ReLU] * (len(kinds) // 2) and not hooked
 
 
 def _convolved(
@@ -127,4 +136,5 @@ def _has_fused_convolution(dtype: torch.dtype) -> bool:
 def _is_fused(x: Tensor, dtype: torch.dtype) -> bool:
     """Whether oneDNN convolves, and applies a function to the result in the same step."""
     inference = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
-    return inference and _has_fused_convolution(dtype)
+    # It has no rule for derivatives in forward mode, which are zero then.
+    return inference and not is_transformed() and _has_fused_convolution(dtype)

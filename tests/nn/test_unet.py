@@ -1,5 +1,7 @@
 """The U-Net: its scales, and what is faster on a CPU."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -48,7 +50,25 @@ def test_a_network_that_does_not_learn_has_its_derivative_forward() -> None:
     unet = UNet(3, [4] * 4).double().requires_grad_(False)
     image, direction = (torch.randn(1, 3, 16, 24, dtype=torch.float64) for _ in range(2))
     _, forward = torch.func.jvp(lambda x: unet(x)[0], (image,), (direction,))
+    with torch.no_grad():
+        unet32, (x, v) = copy.deepcopy(unet).float(), (each.float() for each in (image, direction))
+        assert torch.func.jvp(lambda x: unet32(x)[0], (x,), (v,))[1].sub(forward).abs().max() < 1e-4
     leaf = image.clone().requires_grad_()
     weights = torch.randn_like(forward)
     (unet(leaf)[0] * weights).sum().backward()
     torch.testing.assert_close((forward * weights).sum(), (leaf.grad * direction).sum())
+
+
+def test_inference_calls_the_layers_that_are_there() -> None:
+    net, seen = UNet(3, [4] * 3), []
+    block = net.encoder[0]
+    block[1] = torch.nn.LeakyReLU(0.5)
+    torch.nn.utils.parametrizations.weight_norm(net.encoder[1][0])
+    net.decoder[0][0].register_forward_hook(lambda *_: seen.append(1))
+    image = torch.rand(1, 3, 9, 8)
+    trained = net(image)
+    with torch.no_grad():
+        inferred = net(image)
+    for a, b in zip(trained, inferred, strict=True):
+        torch.testing.assert_close(a, b)
+    assert seen == [1, 1]
