@@ -271,9 +271,13 @@ class Frame:
         return self.map(lambda value: value.to(target))
 
     def crop(self, rows: slice, columns: slice) -> Frame:
-        """A rectangle of the frame, as views; its statistics stay those of the whole image, and nothing is skipped."""
+        """A rectangle of the frame, as views, seen by the camera of that part; ``rows`` and ``columns`` skip none.
+
+        Its statistics stay those of the whole image, and nothing of it is skipped.
+        """
         images = replace(self, view_projection=None, skip=None).map(lambda value: value[..., rows, columns])
-        return replace(images, view_projection=self.view_projection)
+        view = self.view_projection
+        return replace(images, view_projection=None if view is None else part_of_view(view, self.size, rows, columns))
 
     def with_depth(self) -> Frame:
         """The frame with a depth computed from positions and a camera (clip w), if it has these but no depth."""
@@ -388,6 +392,16 @@ pytree.register_pytree_node(
 def scale_samples(samples: Tensor, factor: Tensor) -> Tensor:
     """Multiply the radiance of samples ``(B, S, C, H, W)`` by a ``(B, 3, H, W)`` factor; keep other channels."""
     return torch.cat([samples[:, :, :3] * factor[:, None], samples[:, :, 3:]], 2)
+
+
+def part_of_view(view: Tensor, size: tuple[int, int], rows: slice, columns: slice) -> Tensor:
+    """Camera matrices ``(..., 4, 4)`` of a rectangle of an image: clip x and y go from -1 to 1 across it."""
+    view = view.clone()
+    for axis, (pixels, part) in enumerate(zip(size[::-1], (columns, rows), strict=True)):
+        start, stop, _ = part.indices(pixels)
+        offset = (pixels - 2 * start) / (stop - start) - 1
+        view[..., axis] = view[..., axis] * (pixels / (stop - start)) + view[..., 3] * offset
+    return view
 
 
 def _check_layer(name: str, layer: object, color: Tensor) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import RADIANCE, Frame, Hints
+from mcdenoise.frame import RADIANCE, Frame, Hints, part_of_view
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import demodulate
@@ -138,10 +138,11 @@ class ClipSampler:
         top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = _Turn(_randint(4), bool(_randint(2)))
+        rows, columns = slice(top, top + self.crop), slice(left, left + self.crop)
         clip = shot.read(
             slice(start, start + frames),
-            slice(top, top + self.crop),
-            slice(left, left + self.crop),
+            rows,
+            columns,
             noise_seed=noise_seed,
             channels=dict.fromkeys(_COLORED, order) | dict.fromkeys(_WORLD, axes),
             turn=turn.image,
@@ -152,7 +153,7 @@ class ClipSampler:
         if "motion" in clip:
             clip["motion"] = turn.vectors(clip["motion"])
         if "view_projection" in clip:
-            view = _cropped(clip["view_projection"], (height, width), (top, left), self.crop)
+            view = part_of_view(clip["view_projection"], shot.size, rows, columns)
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
@@ -230,15 +231,6 @@ class _Turn:
             # A vector to the right points up after the rotation.
             x, y = y, -x
         return torch.stack([-x if self.flip else x, y], 1)
-
-
-def _cropped(view: Tensor, size: tuple[int, int], corner: tuple[int, int], crop: int) -> Tensor:
-    """Camera matrices ``(T, 4, 4)`` for a square crop of the image: clip x and y go from -1 to 1 across it."""
-    view = view.clone()
-    for column, (pixels, start) in enumerate(zip(size[::-1], corner[::-1], strict=True)):
-        offset = (pixels - 2 * start) / crop - 1
-        view[..., column] = view[..., column] * (pixels / crop) + view[..., 3] * offset
-    return view
 
 
 def _light(clip: dict[str, Tensor], factor: Tensor) -> None:
