@@ -109,7 +109,7 @@ def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> N
     )
     one_pass = ["A!", "B!", "C!", *"ABC" * 2]
     # The warm-up and two rounds over the frames; then two warm-up calls and two rounds of the size.
-    assert [*one_pass * 3, *"ABC" * 4] == LOG
+    assert [*one_pass * 4, *"ABC"] == LOG
     assert steps == [(step, 13) for step in range(1, 14)]
     for cell in results.cells:
         # The first of three frames, which has no history, does not count.
@@ -118,6 +118,19 @@ def test_methods_take_turns_frame_by_frame(small_sequence: Path, out: Path) -> N
         assert list(cell.stages) == ["read", "accumulate", "filter", "write"]
     assert [(cost.method, cost.width, cost.height) for cost in results.costs] == [(name, 16, 12) for name in "ABC"]
     assert {cost.milliseconds.count for cost in results.costs} == {2}
+
+
+def test_sizes_have_a_history_after_a_still(small_sequence: Path, out: Path) -> None:
+    alone: list[bool] = []
+
+    def look(frame: Frame) -> Tensor:
+        alone.append(frame.hints.alone)
+        return frame.color / 2
+
+    run_benchmark(
+        [open_sequence(small_sequence, "2")], [scripted("A", look)], out, Settings(rounds=1, sizes=((16, 12),))
+    )
+    assert alone == [True] * 2 + [False] * 3
 
 
 def test_errors_and_pictures_are_of_the_images(small_sequence: Path, out: Path) -> None:

@@ -108,6 +108,9 @@ def measure_sizes(
     costs: list[Cost] = []
     for width, height in sizes:
         times: dict[str, list[float]] = {}
+        for method in methods:
+            # What came before may have been a still, whose denoiser expects no further frame.
+            made[method.name].denoiser.reset()
         lacks = {method.name: _lack(peaks, method, width, height, device) for method in methods}
         failures = {name: reason for name, reason in lacks.items() if reason}
         frame = synthetic_frame(width, height).to(device)
@@ -127,7 +130,6 @@ def measure_sizes(
                     times.setdefault(name, []).append(taken)
             on_step()
         for name in (method.name for method in methods):
-            made[name].denoiser.reset()
             failed = failures.get(name, "")
             costs.append(Cost(name, width, height, None if failed else Spread.of(times[name]), failed))
     fits = [fit_line(method.name, costs) for method in methods]
