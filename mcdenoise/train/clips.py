@@ -98,7 +98,7 @@ class ClipSampler:
         tint: each color channel of the light is scaled by up to this many stops, up or down.
 
     Raises:
-        InputError: no shot is long enough, or one is smaller than the crop.
+        InputError: no shot is long enough, one is smaller than the crop, or clips differ in their number of references.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class ClipSampler:
         self.shots = [shot for shot in shots if _is_enough(len(shot), frames)]
         self.frames, self.crop = frames, crop
         self.lamps, self.key, self.exposure, self.tint = lamps, key, exposure, tint
-        check_sizes([(len(shot), shot.size) for shot in self.shots], frames, crop)
+        check_sizes([(len(shot), shot.references, shot.size) for shot in self.shots], frames, crop)
         self.chances = torch.tensor([float(max(len(shot), frames)) for shot in self.shots])
 
     def draw(self, seeds: Sequence[int]) -> Clip:
@@ -186,26 +186,38 @@ class ClipSampler:
             clip[name][..., top : top + height, left : left + width] = painted[name]
 
 
-def check_sizes(shots: Sequence[tuple[int, tuple[int, int]]], frames: int, crop: int) -> None:
-    """Check that clips can be cut from shots.
+def check_sizes(shots: Sequence[tuple[int, int, tuple[int, int]]], frames: int, crop: int) -> int:
+    """Check that clips can be cut from shots, and stacked.
 
     Args:
-        shots: number of frames, and height and width in pixels of each.
+        shots: number of frames, number of references, and height and width in pixels of each.
         frames: T, the number of frames of a clip.
         crop: side of the square crop in pixels.
 
+    Returns:
+        Number of references of a clip.
+
     Raises:
-        InputError: no shot is long enough, or one of these is smaller than the crop.
+        InputError: no shot is long enough, one of these is smaller than the crop, or clips differ in their number of
+            references.
     """
-    sizes = [size for length, size in shots if _is_enough(length, frames)]
-    if not sizes:
+    used = [shot for shot in shots if _is_enough(shot[0], frames)]
+    if not used:
         raise InputError(f"training clips: expected a sequence of at least {frames} frames, found none")
-    for size in sizes:
+    # A clip of a still has that reference in each of its parts.
+    counts = {frames if length == 1 else min(frames, references) for length, references, _ in used}
+    if len(counts) > 1:
+        raise InputError(
+            f"training clips: expected equally many references in clips of {frames} frames, found {min(counts)} in "
+            f"some and {max(counts)} in others; choose --frames {min(counts)}, or train on other data"
+        )
+    for *_, size in used:
         if min(size) < crop:
             raise InputError(
                 f"training clips: expected images of at least {crop} pixels, found {size}; "
                 "choose a smaller --crop, a multiple of 32, or larger images"
             )
+    return counts.pop()
 
 
 def _is_enough(length: int, frames: int) -> bool:

@@ -14,7 +14,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.models import Needs
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
-from mcdenoise.train.footage import FEATURES, Source, check_trainable, features_of, shots_of
+from mcdenoise.train.footage import FEATURES, Source, check_trainable, features_of, references_of, shots_of
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Shot
 
@@ -49,8 +49,8 @@ class TrainingData:
 
         Raises:
             InputError: there is no training folder, a sequence lacks references or features that the model needs,
-                frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, a file
-                is damaged, or the cache cannot be written.
+                frames are missing within a sequence, no sequence is long enough, one is smaller than the crop, clips
+                would have different numbers of references, a file is damaged, or the cache cannot be written.
         """
         if not training:
             raise InputError("training data: expected at least one sequence folder, found none; name one or more")
@@ -69,7 +69,11 @@ class TrainingData:
         least, held = config.frames + config.validation_frames, [0] * len(takes)
         held += [config.validation_frames if len(sequence) >= least else 0 for sequence in sequences]
         both: list[tuple[Source, int]] = list(zip([*takes, *sequences], held, strict=True))
-        check_sizes([(len(source) - kept, source.size) for source, kept in both], config.frames, config.crop)
+        sizes = [(len(source) - kept, references_of(source) - kept, source.size) for source, kept in both]
+        if check_sizes(sizes, config.frames, config.crop) == 1 and config.temporal_weight:
+            raise InputError(
+                f"temporal_weight: expected 0 for takes with one reference each, found {config.temporal_weight}"
+            )
 
         handed = front, used & common, config.frames, cache
         shots: list[Shot] = []

@@ -36,6 +36,11 @@ def features_of(source: Source) -> frozenset[str]:
     return frozenset(names) - {"color", "reference", ERROR}
 
 
+def references_of(source: Source) -> int:
+    """Number of the last frames that have a reference: all of a sequence, see :func:`check_trainable`."""
+    return source.references if isinstance(source, Shard) else len(source)
+
+
 def check_trainable(source: Source, wanted: frozenset[str]) -> None:
     """Check that headers show everything that training needs.
 
@@ -101,20 +106,20 @@ def shots_of(
     Raises:
         InputError: a file is damaged, or the cache cannot be written.
     """
-    length, first = len(source), 0
+    length, references, first = len(source), references_of(source), 0
     wanted = frozenset({*front.parts, *features, "reference"})
     every = start_every if front.accumulates and start_every else length
     later = [start for start in range(every, length, every) if length - held - start >= frames]
     read: Callable[[int], Mapping[str, Array]]
     keep: Keep = _as_halves
     if isinstance(source, Shard):
-        seeds, references, digest = 1, source.references, source.digest
+        seeds, digest = 1, source.digest
         if front.accumulates and references < length:
             first = max(length - frames, 0)
             later = later and [later[int(digest, 16) % len(later)]]
         read = functools.partial(_packed, source, None if front.wrappers else wanted)
     else:
-        seeds, references = min(noise_seeds or source.noise_seeds, source.noise_seeds), length
+        seeds = min(noise_seeds or source.noise_seeds, source.noise_seeds)
         keep = open_cache(source, [front.settings, sorted(wanted), noise_seeds], cache)
         arrays = keep("frames", functools.partial(_decoded, source, wanted, seeds, keep_all=bool(front.wrappers)))
         read, digest = functools.partial(_of_seed, arrays), arrays["sha256"].tobytes().hex()

@@ -154,13 +154,35 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
         assert torch.equal(tensor, saved[key].half().float())
 
 
+def take(path: Path, frames: int, references: int) -> Path:
+    arrays = {name: np.full((frames, 3, 16, 16), 0.5) for name in ("color", "albedo", "normal")}
+    arrays |= {name: np.full((references, 3, 16, 16), 0.5) for name in ("reference", "reference_error")}
+    arrays |= {"depth": np.ones((frames, 1, 16, 16))}
+    write_shard(path, {"credits": ["chair (Ann, CC-BY 3.0)"]}, arrays)
+    return path
+
+
 def test_weights_name_the_authors_of_packed_takes(tmp_path: Path) -> None:
-    arrays = {name: np.full((2, 3, 16, 16), 0.5) for name in ("color", "albedo", "normal", "reference")}
-    arrays |= {"reference_error": np.zeros((2, 3, 16, 16)), "depth": np.ones((2, 1, 16, 16))}
-    write_shard(tmp_path / "0.take.npz", {"credits": ["chair (Ann, CC-BY 3.0)"]}, arrays)
     config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 0})
-    weights = train(config, [tmp_path / "0.take.npz"], tmp_path / "run")
+    weights = train(config, [take(tmp_path / "0.take.npz", 2, 2)], tmp_path / "run")
     assert json.loads(describe_weights(weights)["data"])[-1]["credits"] == ["Ann, CC-BY 3.0"]
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"), [((1, 1), "found 2 in some and 3 in others"), ((4, 1), "found 1 in some and 2 in others")]
+)
+def test_clips_of_unequally_many_references_leave_no_run(tmp_path: Path, other: tuple[int, int], expected: str) -> None:
+    takes = [take(tmp_path / "0.take.npz", 4, 2), take(tmp_path / "1.take.npz", *other)]
+    config = TrainConfig(**{**SMALL, "frames": 3})
+    assert expected in refused(lambda: train(config, takes, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
+    takes = [take(tmp_path / "0.take.npz", 3, 1)]
+    message = refused(lambda: train(TrainConfig(**SMALL), takes, tmp_path / "run"))
+    assert message.startswith("temporal_weight: ")
+    train(TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0}), takes, tmp_path / "run")
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
