@@ -116,7 +116,8 @@ def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float 
 def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
     """L1 of values, of gradients and of temporal differences, with larger weights for later frames of a clip.
 
-    ``L = sum_t g_t (0.8 L_s + 0.1 L_g + w_t L_t) / sum_t g_t``, with ``P = log(1 + R)`` and ``T = log(1 + Y)``:
+    ``L = sum_t g_t (0.8 L_s + 0.1 L_g + w_t L_t) / sum_t g_t``, with ``P = log(1 + R)`` (R where that is negative) and
+    ``T = log(1 + Y)``:
 
     - ``L_s = mean |P - T|``,
     - ``L_g = mean |dP - dT|`` over the differences between neighbours along x, and along y, the mean of both,
@@ -128,7 +129,7 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
     gradients, and the division by the sum of the weights, which makes the loss independent of the clip's length.
 
     Args:
-        image: R, ``(B, T, 3, H, W)`` scene-linear radiance, not negative.
+        image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
         reference: Y, the same shape.
         temporal_weight: ``w_t``.
 
@@ -149,7 +150,7 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
         0.3244
     """
     check_images(image, reference)
-    error = torch.log1p(image) - torch.log1p(reference)
+    error = _compressed(image) - _compressed(reference)
     frames = error.shape[1]
     counts = torch.exp(-torch.arange(frames - 1, -1, -1, device=error.device).to(error.dtype).square() / 8)
     each = 0.8 * _by_frame(error)
@@ -161,6 +162,11 @@ def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) 
     change = torch.cat([torch.zeros_like(error[:, :1]), error.diff(dim=1)], 1)
     each = each + temporal_weight * _by_frame(change)
     return (each * counts).sum(1).mean() / counts.sum()
+
+
+def _compressed(image: Tensor) -> Tensor:
+    # A network without a last activation begins with negative light, whose logarithm may be none.
+    return torch.where(image < 0, image, torch.log1p(image.clamp_min(0)))
 
 
 def _by_frame(error: Tensor) -> Tensor:

@@ -98,5 +98,14 @@ def test_the_gradient_of_the_recurrent_autoencoders_loss() -> None:
     assert gradcheck(rae_loss, (image, reference))
 
 
+def test_the_recurrent_autoencoders_loss_leads_out_of_negative_light() -> None:
+    image = torch.full((1, 1, 3, 2, 2), -2.0).requires_grad_()
+    loss = rae_loss(image, torch.full_like(image, 0.5))
+    loss.backward()
+    assert loss.item() == pytest.approx(0.8 * (2 + math.log(1.5)))
+    assert image.grad is not None
+    torch.testing.assert_close(image.grad, torch.full_like(image, -0.8 / 12))
+
+
 def test_every_loss_has_its_name() -> None:
     assert set(LOSSES) == set(get_args(Loss))
