@@ -360,6 +360,16 @@ def test_packed_takes_are_tiles_with_two_histories(packed: Path) -> None:
     assert torch.equal(tiles.fixed[:, -3:], torch.full_like(tiles.fixed[:, -3:], 0.5))
 
 
+def test_a_part_that_lacks_new_takes_is_packed_again(packed: Path, tmp_path: Path) -> None:
+    part = packed / "part-00.npz"
+    assert run("gpu/pack.py", tmp_path / "takes", "-o", packed) == ""
+    shutil.copyfile(tmp_path / "takes" / "1.take.npz", tmp_path / "takes" / "2.take.npz")
+    assert run("gpu/pack.py", tmp_path / "takes", "-o", packed).startswith(f"{part}: 3 takes")
+    with np.load(part, allow_pickle=False) as arrays:
+        index = json.loads(arrays["about"].tobytes())["index"]
+    assert [take["take"] for take in index] == ["0", "1", "1", "2", "2"]
+
+
 def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "recipe.toml"
     recipe.write_text('[train]\nmodel = "wild_small"\ncrop = 32\nlamps = 0.5\nkey = 0.2\n[[data]]\nseeds = "0"\n')

@@ -4,7 +4,7 @@
 
 Each take has passed the wrappers in front of the network: the radiance of its last frames is accumulated, once with the
 whole history and once with a shorter one. Values keep six bits of mantissa, so that a part has some fifty takes in 60
-MB. A part that exists is not written again.
+MB. A part that has the same takes already is not written again.
 """
 
 import argparse
@@ -76,6 +76,12 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
     print(f"{path}: {len(shards)} takes, {path.stat().st_size / 1e6:.1f} MB", flush=True)
 
 
+def checksum(path: Path) -> str:
+    """That of the takes of a part."""
+    with np.load(path, allow_pickle=False) as part:
+        return str(json.loads(part["about"].tobytes())["sha256"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("takes", nargs="+", type=Path, metavar="TAKES")
@@ -87,9 +93,9 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     shards = open_takes(options.takes)
     for first in range(0, len(shards), options.size):
-        path = options.out / f"part-{first // options.size:02}.npz"
-        if not path.exists():
-            written(shards[first : first + options.size], front, path)
+        path, own = options.out / f"part-{first // options.size:02}.npz", shards[first : first + options.size]
+        if not (path.exists() and checksum(path) == describe_takes(own)["sha256"]):
+            written(own, front, path)
 
 
 if __name__ == "__main__":
