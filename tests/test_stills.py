@@ -75,6 +75,8 @@ def test_the_layers_of_a_file_are_kept(buffers: dict[str, NDArray[Any]], tmp_pat
     [
         (("x.pfm", "-o", "x.pfm"), "found the same"),
         (("x.pfm", "--albedo", "y.pfm", "-o", "y.pfm"), "found the same"),
+        (("shot_#.pfm", "--frames", "1", "-o", "shot_1.pfm"), "found the same"),
+        (("shot_#.pfm", "--frames", "2", "-o", "shot_1.pfm"), "found the same"),
         (("x.pfm", "z.pfm", "--albedo", "y.pfm", "-o", "out.pfm"), "found 2 inputs"),
         (("x.pfm", "--albedo", "none.pfm", "-o", "out.pfm"), "none.pfm"),
         (("x.pfm", "--preview", "-o", "out.pfm"), "found --preview"),
@@ -94,7 +96,8 @@ def test_what_cannot_be_one_file_is_refused(
         write_radiance(Path(f"shot_{number}.pfm"), buffers["x"])
     assert expected in refuses("denoise", *arguments, "--model", "noisy")
     assert not any(Path(name).exists() for name in ("out.pfm", "out.JPG"))
-    np.testing.assert_array_equal(read(Path("x.pfm")), buffers["x"])
+    for name, buffer in (("x", "x"), ("y", "y"), ("shot_1", "x")):
+        np.testing.assert_array_equal(read(Path(f"{name}.pfm")), buffers[buffer])
 
 
 def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from mcdenoise.data import Sequence
 from mcdenoise.data.files import make_folder
 from mcdenoise.data.images import FORMATS, Metadata
 from mcdenoise.data.radiance import write_radiance
+from mcdenoise.data.readers.names import find_files
 from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence, prepare_folder
 from mcdenoise.frame import MOTION
@@ -74,7 +75,8 @@ def denoise(
     if len(opened) > 1 or shot.preview:
         found = f"{len(opened)} frames" if len(opened) > 1 else "--preview"
         raise InputError(f"{out}: expected a single frame for a file, and no preview, found {found}; name a folder")
-    if any(os.path.realpath(out) == os.path.realpath(each) for each in (*inputs, albedo, normal) if each):
+    read = [*opened.files(opened.numbers[0]), *find_files([*inputs, *filter(None, (albedo, normal))])]
+    if os.path.realpath(out) in map(os.path.realpath, read):
         raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
     make_folder(out.parent)
     with tempfile.TemporaryDirectory(prefix=".denoised-", dir=out.parent) as folder:
