@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mcdenoise import denoise
 from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.files import folder_beside
 from mcdenoise.data.radiance import write_radiance
+from mcdenoise.interruption import remove_unfinished
 
 SIZE = (24, 32)
 # Largest relative error of a format's numbers, and the largest one beside it; half floats have 11 bits, RGBE 8.
@@ -98,6 +100,21 @@ def test_what_cannot_be_one_file_is_refused(
     assert not any(Path(name).exists() for name in ("out.pfm", "out.JPG"))
     for name, buffer in (("x", "x"), ("y", "y"), ("shot_1", "x")):
         np.testing.assert_array_equal(read(Path(f"{name}.pfm")), buffers[buffer])
+
+
+def test_a_folder_that_nothing_can_be_written_to_is_refused(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    out = Path("/proc/clean.pfm")
+    assert str(out) in refuses("denoise", tmp_path / "x.pfm", "-o", out, "--model", "noisy")
+
+
+def test_a_command_that_is_killed_leaves_no_folder_beside_its_file(
+    buffers: dict[str, NDArray[Any]], tmp_path: Path
+) -> None:
+    """A model that is busy in native code hears no signal, so that the process ends without it."""
+    with folder_beside(tmp_path / "clean.pfm") as folder:
+        (folder / "x.pfm").touch()
+        remove_unfinished()
+        assert not folder.exists()
 
 
 def test_an_image_is_compared_with_a_reference(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Callable
 from collections.abc import Sequence as Sequential
@@ -21,7 +20,7 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import make_folder
+from mcdenoise.data.files import folder_beside
 from mcdenoise.data.images import FORMATS, Metadata
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.data.readers.names import find_files
@@ -78,10 +77,9 @@ def denoise(
     read = [*opened.files(opened.numbers[0]), *find_files([*inputs, *filter(None, (albedo, normal))])]
     if os.path.realpath(out) in map(os.path.realpath, read):
         raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
-    make_folder(out.parent)
-    with tempfile.TemporaryDirectory(prefix=".denoised-", dir=out.parent) as folder:
+    with folder_beside(out) as folder:
         images: list[Tensor] = []
-        written = _denoise(opened, Path(folder), shot, json, out, lambda name, image, metadata: images.append(image))
+        written = _denoise(opened, folder, shot, json, out, lambda name, image, metadata: images.append(image))
         if FORMATS.get(written.suffix.lower()) == FORMATS[out.suffix.lower()]:
             written.replace(out)
         else:

@@ -145,6 +145,21 @@ def new_folder(path: Path) -> Iterator[Path]:
             os.rename(temporary, path)
 
 
+@contextmanager
+def folder_beside(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside a file that is to be written, and remove it with its contents after the block.
+
+    Args:
+        path: the file; its folder is created if it does not exist.
+
+    Raises:
+        InputError: the operating system refuses to write there.
+    """
+    temporary = path.parent.absolute() / _name()
+    with _temporary(path, temporary, folder=True):
+        yield temporary
+
+
 def _name() -> str:
     """A name of an incomplete file that no other has."""
     return f"{_PREFIX}{secrets.token_hex(8)}{_MARK}"
