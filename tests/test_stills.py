@@ -1,6 +1,7 @@
 """Single images on the command line: a file in, a file out in any format; and an image compared with a reference."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,19 @@ def test_what_cannot_be_one_file_is_refused(
     assert not any(Path(name).exists() for name in ("out.pfm", "out.JPG"))
     for name, buffer in (("x", "x"), ("y", "y"), ("shot_1", "x")):
         np.testing.assert_array_equal(read(Path(f"{name}.pfm")), buffers[buffer])
+
+
+@pytest.mark.parametrize(("layers", "out"), [("parts.exr", "out.exr"), ("parts.exr", "out.pfm"), ("shot.exr", "out")])
+def test_layers_in_a_file_of_their_own_are_not_lost(
+    layers: str, out: str, buffers: dict[str, NDArray[Any]], tmp_path: Path
+) -> None:
+    """Neither where one file is written, nor where both would get the same name."""
+    files = [tmp_path / "image" / "shot.exr", tmp_path / "layers" / layers]
+    for path, prefix in zip(files, ("", "emission."), strict=True):
+        path.parent.mkdir()
+        write_exr(path, buffers["x"], [f"{prefix}{letter}" for letter in "RGB"])
+    assert layers in refuses("denoise", *files, "--layers", "emission", "--model", "noisy", "-o", tmp_path / out)
+    assert not list(tmp_path.glob("out*")) or os.listdir(tmp_path / out) == []
 
 
 def test_a_folder_that_nothing_can_be_written_to_is_refused(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
-from mcdenoise.data.files import folder_beside
+from mcdenoise.data.files import folder_beside, listed
 from mcdenoise.data.images import FORMATS, Metadata
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.data.readers.names import find_files
@@ -79,7 +79,13 @@ def denoise(
         raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
     with folder_beside(out) as folder:
         images: list[Tensor] = []
-        written = _denoise(opened, folder, shot, json, out, lambda name, image, metadata: images.append(image))
+
+        def keep(name: str, image: Tensor, metadata: Metadata) -> None:
+            images.append(image)
+            if len(names := [each.name for each in listed(folder) if each.suffix.lower() in FORMATS]) > 1:
+                raise InputError(f"{out}: expected one file to write, found {', '.join(names)}; name a folder for them")
+
+        written = _denoise(opened, folder, shot, json, out, keep)
         if FORMATS.get(written.suffix.lower()) == FORMATS[out.suffix.lower()]:
             written.replace(out)
         else:

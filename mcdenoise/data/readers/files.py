@@ -203,8 +203,14 @@ class RenderedFiles(FrameSequence):
             files[own.group][own.part, own.channels[3 if own == layer else 0]] = alpha[..., 0]
         for group, channels in self._lights(number, lights).items():
             files[group] |= channels
-        for group in {layer.group, *files}:
-            source = self.groups[group].files[number]
+        sources = {group: self.groups[group].files[number] for group in {layer.group, *files}}
+        targets: dict[str, Path] = {}
+        for source in sources.values():
+            if (other := targets.setdefault(self.target(source), source)) != source:
+                raise InputError(
+                    f"{source}: expected a name that no other file to write has, found that of {other}; rename one"
+                )
+        for group, source in sources.items():
             write_like(
                 *(source, out / self.target(source), self._cropped(source, files[group])),
                 like=layer.channels[0],
