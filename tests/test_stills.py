@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from commands import refuses, run, succeeds
 from numpy.typing import NDArray
 
 from mcdenoise import denoise
 from mcdenoise.data import open_sequence, read_exr, write_exr
+from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.files import folder_beside
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.interruption import remove_unfinished
@@ -192,6 +194,16 @@ def test_light_that_a_format_cannot_hold_is_told(buffers: dict[str, NDArray[Any]
         status, _, said = run("denoise", tmp_path / "bright.pfm", "-o", tmp_path / f"out{ending}", "--model", "noisy")
         assert (status, "clamped" in said) == (0, told != "")
         assert told in said
+
+
+@pytest.mark.parametrize("ending", [".png", ".pfm"])
+def test_other_formats_get_the_primaries_that_they_are_read_in(ending: str, tmp_path: Path) -> None:
+    acescg = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+    green = np.broadcast_to(np.float32([0.3, 0.7, 0.3]), (*SIZE, 3))
+    write_exr(tmp_path / "noisy.exr", green, list("RGB"), full_float=True, metadata={"chromaticities": acescg})
+    succeeds("denoise", tmp_path / "noisy.exr", "--model", "noisy", "-o", tmp_path / f"clean{ending}")
+    expected = to_rec709(torch.from_numpy(green[0, 0].copy())[:, None, None], {"chromaticities": acescg})
+    np.testing.assert_allclose(read(tmp_path / f"clean{ending}")[0, 0], expected[:, 0, 0], atol=ERRORS[".png"][1])
 
 
 def test_layers_before_the_input_are_told_from_it(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_
 from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
+from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.files import folder_beside, listed
 from mcdenoise.data.images import FORMATS, Metadata
 from mcdenoise.data.radiance import write_radiance
@@ -78,10 +79,10 @@ def denoise(
     if os.path.realpath(out) in map(os.path.realpath, read):
         raise InputError(f"{out}: expected another file than the input, found the same; choose one to write to")
     with folder_beside(out) as folder:
-        images: list[Tensor] = []
+        images: list[tuple[Tensor, Metadata]] = []
 
         def keep(name: str, image: Tensor, metadata: Metadata) -> None:
-            images.append(image)
+            images.append((image, metadata))
             if len(names := [each.name for each in listed(folder) if each.suffix.lower() in FORMATS]) > 1:
                 raise InputError(f"{out}: expected one file to write, found {', '.join(names)}; name a folder for them")
 
@@ -89,8 +90,10 @@ def denoise(
         if FORMATS.get(written.suffix.lower()) == FORMATS[out.suffix.lower()]:
             written.replace(out)
         else:
-            # Not what the copy of the input holds, which may have been rounded to its type.
-            clamped = write_radiance(out, images[0][0].permute(1, 2, 0).float().cpu().numpy())
+            # Not what the copy of the input holds, which may have been rounded to its type. No primaries are stated.
+            ((image, metadata),) = images
+            radiance = to_rec709(image[0].float(), metadata)
+            clamped = write_radiance(out, radiance.permute(1, 2, 0).cpu().numpy())
             if clamped:
                 warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
 
