@@ -30,7 +30,7 @@ from torch.nn.functional import avg_pool2d
 from mcdenoise.commit import source_commit
 from mcdenoise.data import Sequence
 from mcdenoise.data.files import make_folder, remove, write_text
-from mcdenoise.data.readers.opening import open_result
+from mcdenoise.data.readers.opening import Result, open_result
 from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -177,19 +177,24 @@ def look(shot: Shot, out: Path) -> Found:
             # From the files, since frames were denoised in any order.
             shown = settings.preview_in(opened.folder, video=len(records) > 1)
             for path in report.files.values():
-                shown.add(path.stem, *open_result(path).read(sequence.window))
+                shown.add(path.stem, *_result(path, settings).read(sequence.window))
             shown.close()
     warnings = (*sequence.warnings, *(report.warnings if records else []))
-    return replace(found, missing=missing, pictures=tuple(_pictures(out, shot.name, report.files)), warnings=warnings)
+    return replace(found, missing=missing, pictures=tuple(_pictures(out, found.shot, report.files)), warnings=warnings)
 
 
-def _pictures(out: Path, name: str, files: dict[int, Path]) -> Iterable[tuple[int, str]]:
+def _result(path: Path, settings: ShotSettings) -> Result:
+    """The denoised radiance in a file that was written with these settings."""
+    return open_result(path, settings.output_layer, "linear" if settings.input_linear else "auto")
+
+
+def _pictures(out: Path, shot: Shot, files: dict[int, Path]) -> Iterable[tuple[int, str]]:
     """Write thumbnails of some frames across the shot."""
-    numbers, shown = list(files), Preview(out / PICTURES / name, video=False)
+    numbers, shown = list(files), Preview(out / PICTURES / shot.name, video=False)
     for place in np.linspace(0, len(numbers) - 1, min(_PICTURES, len(numbers))).round().astype(int):
         # A picture that cannot be made is missing on the page, and nothing else.
         with suppress(InputError):
-            image, metadata = open_result(files[numbers[place]]).read()
+            image, metadata = _result(files[numbers[place]], shot.settings).read()
             shown.add(f"{numbers[place]}", avg_pool2d(image, -(-max(image.shape) // _SIDE), ceil_mode=True), metadata)
             yield numbers[place], os.path.relpath(shown.written[-1], out)
 

@@ -8,14 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from commands import run as command
 from commands import succeeds
 from shots import Inline, edit, pixels, same, write_manifest, write_shot
 
+from mcdenoise import Denoiser
 from mcdenoise.data.files import held
+from mcdenoise.data.png import read_png
+from mcdenoise.data.radiance import write_radiance
 from mcdenoise.errors import InputError
 from mcdenoise.film import ShotResult, read_film, run_film
+from mcdenoise.metrics import display_codes
 from mcdenoise.shot import ShotSettings
 
 MODEL = "accumulated"
@@ -56,6 +61,22 @@ def test_it_gives_what_denoise_gives(shots: dict[str, Path], tmp_path: Path) -> 
             own = film["frames"][number]
             assert {**own, "milliseconds": 0, "beside": 0} == {**about, "milliseconds": 0, "beside": 0}
     assert {path.name for path in (tmp_path / "out").iterdir()} == {".film", "film.json", "film_pictures", *shots}
+
+
+@pytest.mark.parametrize(
+    ("ending", "options"),
+    [(".exr", {"output_layer": "Clean"}), (".tif", {"input_linear": True})],
+)
+def test_its_preview_shows_what_was_denoised(ending: str, options: dict[str, Any], tmp_path: Path) -> None:
+    noisy = np.random.default_rng(0).random((20, 32, 3), dtype=np.float32)
+    (tmp_path / "in").mkdir()
+    write_radiance(tmp_path / "in" / f"shot{ending}", noisy)
+    every = {"model": "joint_bilateral", "preview": True, "preview_exposure": 0.0, **options}
+    run({"s": tmp_path / "in"}, tmp_path / "out", **every)
+    opened = ShotSettings(**options).open([tmp_path / "in"])
+    expected = display_codes(Denoiser("joint_bilateral")(opened.frame(0))[0]).permute(1, 2, 0).numpy()
+    found = read_png(tmp_path / "out/s/preview/shot.png")
+    np.testing.assert_allclose(found.astype(int), expected, atol=1)
 
 
 def test_finished_frames_are_not_made_again(shots: dict[str, Path], tmp_path: Path) -> None:

@@ -147,16 +147,21 @@ class Result:
         return image, read_image_header(self.path).metadata
 
 
-def open_result(path: Path) -> Result:
+def open_result(path: Path, layer: str | None = None, color_space: ColorSpace = "auto") -> Result:
     """Find the radiance in a denoiser's output file, which may have other layers.
+
+    Args:
+        path: the file.
+        layer: name of the layer of the radiance, if names do not tell.
+        color_space: see :func:`open_files`.
 
     Raises:
         InputError: the file cannot be read, or its radiance cannot be determined.
     """
-    parts = read_image_header(path).parts
-    chosen = choose(str(path), layers_of(0, "", parts), {}, functools.partial(read_files, lambda _: path))
-    layer = chosen.written[0]
-    return Result(path, layer, parts[layer.part])
+    parts, mapping = _parts(read_image_header(path), color_space), {} if layer is None else {"color": layer}
+    chosen = choose(str(path), layers_of(0, "", parts), mapping, functools.partial(read_files, lambda _: path))
+    found = chosen.written[0]
+    return Result(path, found, parts[found.part])
 
 
 def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers) -> set[Layer]:
