@@ -247,7 +247,7 @@ class RenderedFiles(FrameSequence):
         if color.shape[2] > 3:
             images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
         images["color"] = _without_lossy_black(color[..., :3])
-        if "mask" in images and (images["mask"] > 0).any():
+        if "mask" in images:
             # A matte of an object is called a mask, too: beside it there is light.
             images["mask"] = np.where((images["color"] > 0).any(-1, keepdims=True), 1, images["mask"] > 0).astype(
                 np.float32

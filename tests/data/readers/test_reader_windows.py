@@ -53,6 +53,17 @@ def test_frames_share_the_window_of_all_and_void_pixels_are_masked(cropped: Path
         np.testing.assert_array_equal(frame.color[0].numpy()[:, inside], expected.reshape(3, -1))
 
 
+@pytest.mark.parametrize("matte", [0.0, 1.0])
+def test_a_matte_of_an_object_masks_no_light_even_where_the_object_is_not_seen(matte: float, tmp_path: Path) -> None:
+    channels = radiance(*DISPLAY, 0) | {"mask": np.zeros(DISPLAY, np.float32)}
+    for name in "RGB":
+        channels[name][:3] = 0
+    channels["mask"][30:] = matte
+    OpenEXR.File([part_of(channels)]).write(str(tmp_path / "shot.exr"))
+    frame = open_sequence(tmp_path / "shot.exr").frame(0)
+    np.testing.assert_array_equal(frame.mask[0, 0].numpy() > 0, np.arange(DISPLAY[0])[:, None] >= np.full(DISPLAY, 3))
+
+
 @pytest.mark.parametrize("options", [{}, {"output_layer": "clean"}])
 def test_each_file_is_written_in_its_own_window(cropped: Path, tmp_path: Path, options: dict[str, str]) -> None:
     denoise_sequence(open_sequence(cropped), tmp_path / "out", Denoiser("noisy"), "noisy", **options)
