@@ -118,6 +118,9 @@ class ShotSettings:
                 raise InputError(f"--{name}: expected a number above 0, found {limit:g}")
         if self.color_with_albedo and self.color_without_albedo:
             raise InputError("--color-with-albedo, --color-without-albedo: expected one of them, found both")
+        if self.output_layer is not None and (self.alpha or self.layers):
+            found = "--alpha" if self.alpha else "--layers"
+            raise InputError(f"--output-layer: expected no option that replaces layers, found {found}; omit one")
         if self.is_budgeted and (self.weights is not None or self.model is not None):
             raise InputError("--budget-ms, --max-error: expected no --model or --weights: they choose it")
 

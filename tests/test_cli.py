@@ -94,6 +94,7 @@ def test_unknown_command() -> None:
         ("--frames", "2-9", "expected frame 4, found frames 0 to 3"),
         ("--threads", "0", "--threads: expected 1 to 1024, found 0"),
         ("--alpha-min", "nan", "--alpha-min: expected in (0, 1], found nan"),
+        ("--output-layer", "clean --layers all", "found --layers"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
         ("--model", "kp", "expected weights of model 'kp', found those of 'cascaded'"),
         (
@@ -107,7 +108,7 @@ def test_unknown_command() -> None:
     ],
 )
 def test_bad_options_leave_nothing(denoise: list[Any], out: Path, option: str, value: str, expected: str) -> None:
-    assert expected in refuses(*denoise, option, value)
+    assert expected in refuses(*denoise, option, *value.split())
     assert not out.exists()
 
 
