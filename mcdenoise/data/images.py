@@ -67,6 +67,11 @@ class Window(NamedTuple):
         """Height and width."""
         return self.bottom - self.top, self.right - self.left
 
+    def holds(self, other: Window) -> bool:
+        """Whether this window has all pixels of another."""
+        begins = self.top <= other.top and self.left <= other.left
+        return begins and other.bottom <= self.bottom and other.right <= self.right
+
     def of(self, image: Image, own: Window, fill: float = 0.0) -> Image:
         """The pixels of this window, from an ``(H, W, C)`` image of another; filled where that has none."""
         if self == own:

@@ -182,7 +182,7 @@ def evaluate_folder(
     check_references(sequence)
     files = find_images(folder, sequence.reference_numbers)
     for path in files.values():
-        check_header(path, sequence.size)
+        check_header(path, sequence)
     images = ((number, *_read(sequence, number, path)) for number, path in files.items())
     return _evaluate(sequence, folder, images, protocol, on_frame)
 
@@ -320,27 +320,30 @@ def _is_still(motion: Tensor) -> bool:
     return known.numel() > 0 and float(known.max()) < _STILL
 
 
-def check_header(path: Path, size: tuple[int, int]) -> None:
-    """Check that an image has the size of its sequence.
+def check_header(path: Path, sequence: Sequence) -> None:
+    """Check that an image has the pixels of its sequence, or a part of them where the sequence's own files have parts.
 
     Raises:
-        InputError: it has another.
+        InputError: it has others.
     """
-    height, width = open_result(path).size
-    if (height, width) != size:
-        raise InputError(
-            f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; denoise at "
-            "that size"
-        )
+    found, whole = open_result(path), sequence.window
+    if found.size == sequence.size or (whole is not None and whole.holds(found.part.window)):
+        return
+    (height, width), size = found.size, sequence.size
+    raise InputError(
+        f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; denoise at that "
+        "size"
+    )
 
 
-def read_image(path: Path) -> tuple[Tensor, Metadata]:
-    """Read a denoised image, ``(1, 3, H, W)``, and the attributes of its file.
+def read_image(path: Path, sequence: Sequence) -> tuple[Tensor, Metadata]:
+    """Read a denoised image of a sequence, ``(1, 3, H, W)``, and the attributes of its file.
 
     Raises:
         InputError: it is damaged, or has pixels that are not finite.
     """
-    image, metadata = open_result(path).read()
+    found = open_result(path)
+    image, metadata = found.read(None if found.size == sequence.size else sequence.window)
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():
         row, column = bad.nonzero()[0].tolist()
@@ -353,7 +356,7 @@ def read_image(path: Path) -> tuple[Tensor, Metadata]:
 
 def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
     """Read image, frame and reference; both images are converted to the primaries of Rec. 709."""
-    image, metadata = read_image(path)
+    image, metadata = read_image(path, sequence)
     try:
         frame, _ = sequence.frame(number).with_depth().validate()
     except InputError as error:

@@ -104,7 +104,7 @@ def evaluate_halves(
     files = {name: find_images(path, sequence.numbers) for name, path in images.items()}
     for each in files.values():
         for path in each.values():
-            check_header(path, sequence.size)
+            check_header(path, sequence)
     result, closer = Halves(str(sequence.root), str(other.root)), dict.fromkeys(files, torch.zeros(1))
     for number, others in numbers.items():
         first, second = _color(sequence, number), _color(other, others)
@@ -116,7 +116,7 @@ def evaluate_halves(
         weight, noise = weights(first, second), (first - second).square() / 2
         squares = {NOISY: noise}
         for name, paths in files.items():
-            image = to_rec709(*read_image(paths[number])).double()
+            image = to_rec709(*read_image(paths[number], sequence)).double()
             squares[name] = (image - second).square() - noise
             gain = (image - second).square() - (image - first).square()
             closer[name] = closer[name] + _blocks(weight * gain)

@@ -2,8 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import pytest
 import torch
+from pictures import part_of
 from torch import Tensor
 
 from mcdenoise.data import Sequence, open_sequence
@@ -39,6 +42,19 @@ def test_the_errors_are_those_of_the_files_that_would_be_written(sequence: Seque
     for name, table in written.tables.items():
         assert found.tables[name].mean == pytest.approx(table.mean, rel=1e-6)
     assert found.warping_error == pytest.approx(written.warping_error)
+
+
+def test_files_with_windows_of_their_own_are_compared_where_they_are(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for number, place in enumerate([(2, 4), (6, 0)]):
+        pixels = np.random.default_rng(number).random((6, 16, 20), dtype=np.float32)
+        names = (*"RGB", "reference.R", "reference.G", "reference.B")
+        part = part_of(dict(zip(names, pixels, strict=True)), place=place, display=(32, 32))
+        OpenEXR.File([part]).write(str(tmp_path / f"in/shot_{number}.exr"))
+    sequence, denoiser = open_sequence(tmp_path / "in"), Denoiser("noisy")
+    denoise_sequence(sequence, tmp_path / "out", denoiser, "noisy", full_float=True)
+    written, found = evaluate_folder(sequence, tmp_path / "out"), evaluate_method(sequence, denoiser, "noisy")
+    assert found.tables["strict"].mean == pytest.approx(written.tables["strict"].mean, rel=1e-6)
 
 
 def test_a_method_sees_frames_without_a_reference_too(small_sequence: Path) -> None:
