@@ -66,7 +66,7 @@ def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Te
 
     Returns:
         Whether its motion is zero everywhere, or else the camera is the same and no position differs from its previous
-        position; a tensor where values are not at hand.
+        position; a tensor where values are not at hand, or ``(B, 1, 1, 1)`` for a batch of which not all are still.
     """
     blind = not at_hand(frame.color.device)
     if frame.motion is not None:
@@ -79,9 +79,11 @@ def is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | Te
     known = [(a, b) for a, b in pairs if a is not None and b is not None]
     if frame.position is None or len(known) < len(pairs):
         return False
-    if blind:
-        return torch.stack([torch.eq(a, b).all() for a, b in known]).all()
-    return all(_equal(a, b) for a, b in known)
+    if not blind:
+        still = all(_equal(a, b) for a, b in known)
+        if still or len(frame.color) == 1:
+            return still
+    return torch.stack([torch.eq(a, b).flatten(1).all(1) for a, b in known]).all(0)[:, None, None, None]
 
 
 def _equal(a: Tensor, b: Tensor) -> bool:

@@ -92,7 +92,7 @@ class _Blended(NamedTuple):
         still: whether that is so.
         reset: why there is no history; empty if there is one.
         found: fraction of the pixels that have a history.
-        cut: whether there is a cut, where that is known on the device only.
+        cut: ``(B, 1, 1, 1)`` whether there is a cut; ``None`` if it is known that all images have one, or none has.
     """
 
     color: Tensor
@@ -113,7 +113,7 @@ class _Blended(NamedTuple):
         """What the report says about the history."""
         if self.cut is None:
             return Note("history", self.reset, value=self.found)
-        return Note("history", "cut", self.cut.float(), self.found, otherwise="")
+        return Note("history", "cut", self.cut.all().float(), self.found, otherwise="")
 
     def history(self, frame: Frame, light: Tensor | None) -> History:
         """The history for the next frame."""
@@ -130,10 +130,10 @@ class Accumulated(Wrapper):
 
     The method sees the accumulated radiance as ``color``, that of the frame alone as ``current``, and the ``length`` of
     the history; where lag is looked for, the radiance of about the last four frames as ``recent``; whether nothing
-    moves, as ``hints.still``; and no state at the beginning of a shot. A shot ends at a cut (less than 5 % of the
-    pixels find their surface in the previous frame), when the image's size changes, where a frame has no motion, and
-    where a buffer of ``also`` is in only one of two successive frames. The accumulated image is the stage
-    ``accumulated``.
+    moves, as ``hints.still``; and no state at the beginning of a shot, or zeros for the images of a batch that begin
+    one. A shot ends at a cut (less than 5 % of the pixels find their surface in the previous frame), when the image's
+    size changes, where a frame has no motion, and where a buffer of ``also`` is in only one of two successive frames.
+    The accumulated image is the stage ``accumulated``.
 
     Motion is the frame's own where it has one, else that of its previous positions (its positions, where it has none)
     seen from the previous camera. Where positions and cameras say that nothing moved, the motion is zero, not the
@@ -227,7 +227,9 @@ class Accumulated(Wrapper):
         if found.reset:
             inner = None
         elif (cut := found.cut) is not None:
-            inner = pytree.tree_map_only(Tensor, lambda tensor: torch.where(cut, 0, tensor), inner)
+            inner = pytree.tree_map_only(
+                Tensor, lambda part: part.masked_fill(cut.view(-1, *[1] * (part.dim() - 1)), 0), inner
+            )
         light, passing = self._lasting(frame, None if found.reset not in ("", NO_MOTION) else history, found)
         still = found.still is True
         notes = [*self._notes(frame, still=still, keeps=keeps), found.note]
@@ -271,26 +273,25 @@ class Accumulated(Wrapper):
         still = is_still(frame, history.view_projection)
         motion = motion_unless_still(frame, history.view_projection, still)
         color, length, kept = self._blend(frame, entering, history.color, seen, history, motion)
-        found = kept.mean()
-        cut = found < CUT_FRACTION
-        if not blind and cut:
-            # The light of the new shot may differ, and the cut is found only here.
-            chosen = self._chosen(frame.color)
+        found, cut = kept.mean(), (kept < CUT_FRACTION)[:, None, None, None]
+        if not blind and cut.any():
+            # The light of a new shot may differ, and the cut is found only here.
+            chosen = torch.where(cut, self._chosen(frame.color), limit)
             if not torch.equal(chosen, limit):
                 limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
-            return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
+            if cut.all():
+                return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
         made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found)
-        if not blind:
+        if not blind and not cut.any():
             return made
         carried = tuple(
             None if part is None or old is None else torch.where(cut, part, old)
             for part, old in zip(self._first(frame, entering), carried, strict=True)
         )
         color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
-        return made._replace(
-            color=color, length=length, carried=carried, next_limit=torch.where(cut, 0, limit), cut=cut
-        )
+        next_limit = torch.where(cut, 0, limit) if blind else limit
+        return made._replace(color=color, length=length, carried=carried, next_limit=next_limit, cut=cut)
 
     def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
         """A frame without a history."""

@@ -2,11 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from planes import leaning_wall
 from torch import Tensor
 from torch.utils import _pytree as pytree
 from toys import Mean, Shot, Watching, still, whole_frame
@@ -69,6 +71,32 @@ def test_a_cut_resets() -> None:
     assert seen.color.unique().tolist() == [2]
     assert seen.length.unique().tolist() == [1]
     assert history.update(still(constant(3, 2.0), normal=wall)).length.unique().tolist() == [2]
+
+
+@pytest.mark.parametrize("in_graph", [False, True])
+def test_each_image_of_a_batch_is_a_shot_of_its_own(in_graph: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One stands still, before a camera off the centre of its pixels, one moves, and one cuts to caustics."""
+    if in_graph:
+        monkeypatch.setattr("mcdenoise.models.accumulated.at_hand", lambda device: False)
+        monkeypatch.setattr("mcdenoise.models._motion.at_hand", lambda device: False)
+
+    def images(model: Accumulated, shots: Sequence[Sequence[Frame]]) -> Tensor:
+        state, found = None, []
+        for each in zip(*shots, strict=True):
+            buffers = {name: torch.cat([frame.buffer(name) for frame in each]) for name in each[0].buffers}
+            output, state = model(Frame(**buffers), state)
+            found.append(output.image)
+        return torch.stack(found)
+
+    def shot(step: float, *numbers: int) -> list[Frame]:
+        return [Frame(torch.rand(1, 3, 128, 160), **leaning_wall(n, 160, 128, step)) for n in numbers]
+
+    shots, model = [shot(0, 0, 1, 2, 3), shot(1, 0, 1, 2, 3), shot(1, 0, 1, 900, 901)], Accumulated(Mean())
+    shots[2][2:] = [frame.replace(color=caustics(0.3).color) for frame in shots[2][2:]]
+    together, alone = images(model, shots), torch.cat([images(model, [shot]) for shot in shots], 1)
+    torch.testing.assert_close(together[:, 1:], alone[:, 1:])
+    # A history that is projected to where it was is blurred.
+    assert torch.equal(together[:, 0], alone[:, 0])
 
 
 def test_disoccluded_surfaces_start_a_history_without_a_cut() -> None:
