@@ -165,6 +165,14 @@ def test_a_recurrent_method_gets_its_state_back(frames: list[Frame]) -> None:
     assert model.states[-1] is None
 
 
+@pytest.mark.parametrize("name", ["svgf", "mrkp"])
+def test_light_with_and_without_its_albedo_have_no_common_history(frames: list[Frame], name: str) -> None:
+    denoiser = Denoiser(name)
+    for frame in (*frames[:2], frames[2].replace(albedo=None), frames[3]):
+        image, alone = denoiser(frame), Denoiser(name)(frame)
+        assert torch.equal(image, alone) is (frame is not frames[1])
+
+
 def test_images_and_states_share_no_memory() -> None:
     """A method's state may hold the frame and the image themselves."""
 

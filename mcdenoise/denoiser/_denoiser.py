@@ -32,7 +32,8 @@ from mcdenoise.models._times import Times, stages_of
 from mcdenoise.models._void import with_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
-from mcdenoise.models._wrapper import name_of
+from mcdenoise.models._wrapper import name_of, parts_of
+from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.noise import noise_of
 
 AskedPrecision = Literal["auto", "float32", "bfloat16"]
@@ -168,6 +169,8 @@ class Denoiser:
     ) -> None:
         """Discard the history: the next frame begins a shot. A cut and a change of size do this automatically.
 
+        So does, for a method that divides light by the albedo, an albedo that only one of two successive frames has.
+
         Args:
             buffers: names of the buffers that every frame of the shot will have, if they are known.
             frames: number of frames of the shot, if it is known.
@@ -187,6 +190,8 @@ class Denoiser:
         self._watch, self._doubted = Watch(), False
         self._shape: tuple[int, ...] = ()
         self._layers: tuple[str, ...] = ()
+        # Whether the last frame had an albedo.
+        self._with_albedo = False
         self._count, self._frames, self._buffers = 0, frames, buffers
         # A single frame has no next one to read.
         self.has_room_ahead = size is not None and frames != 1
@@ -309,7 +314,7 @@ class Denoiser:
             report.milliseconds = times.milliseconds()
         # Only now, so that a rejected frame does not change the state.
         self._state, self._shape, self._count = state, tuple(frame.color.shape), self._count + 1
-        self._layers = self._carried(frame)
+        self._layers, self._with_albedo = self._carried(frame), frame.albedo is not None
         self._before, self._watch = None if watch.pixels is None else before, watch
         return result
 
@@ -326,6 +331,9 @@ class Denoiser:
         )
         if doubt:
             warnings.warn(doubt, stacklevel=level_of_caller())
+        if self._with_albedo != (frame.albedo is not None) and any(parts_of(self.model, Demodulated)):
+            # Light that was divided by an albedo, and light that was not, have no common history.
+            return None, watch
         if repeats:
             report.repeats = REPEATED
             self._doubt(report.repeats)
