@@ -48,6 +48,7 @@ from mcdenoise.nn.inputs import features_of, normalized_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import affinity_filter
+from mcdenoise.ops._window import accumulator_dtype
 
 FEATURES, FILTERS, KERNEL_SIZE, LEVELS = 8, 3, 7, 4
 _OF_FILTER = FEATURES + 2  # a and c
@@ -84,11 +85,11 @@ class Anf(Network):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         frame = frame.with_depth()
-        light = with_carried(frame).to(frame.color.dtype)
+        light = with_carried(frame).to(accumulator_dtype(frame.color.dtype))
         embedded = self.embedded(frame).to(light.dtype)
         sizes = [light.shape[1], light.shape[1], embedded.shape[1], FEATURES]
         found, known, notes = reprojected(frame, state, sum(sizes), "anf")
-        result_before, mean_before, embedded_before, features_before = found.split(sizes, 1)
+        result_before, mean_before, embedded_before, features_before = found.to(light.dtype).split(sizes, 1)
 
         unet_input = torch.cat([embedded, embedded_before], 1)
         predicted = self.head(self.unet(unet_input)[0]).to(light.dtype)
@@ -111,15 +112,17 @@ class Anf(Network):
                 dilation=1 << k,
             )
         kept = Past.of(frame, torch.cat([image, mean, embedded_mean, features], 1))
-        return answered(frame, image).noted(*notes, Note("samples", describe_samples(frame))), kept
+        output = answered(frame, image.to(frame.color.dtype))
+        return output.noted(*notes, Note("samples", describe_samples(frame))), kept
 
     def embedded(self, frame: Frame) -> Tensor:
         """The mean embedding of the samples of each pixel, ``(B, width, H, W)``."""
         statistics = frame.statistics or self.statistics(frame)
         near, typical = statistics["depth_scale"].split(1, 1)
         albedo, normal, depth = features_of(frame)
-        shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(frame.color.dtype)
-        radiance = samples_of(frame).to(frame.color.dtype)
+        dtype = accumulator_dtype(frame.color.dtype)
+        shared = torch.cat([albedo, normal, normalized_depth(depth, near, typical)], 1).to(dtype)
+        radiance = samples_of(frame).to(dtype)
         lights = (torch.log1p(sample * statistics["exposure"]) for sample in radiance.unbind(1))
         # One sample after the other, so that few features are kept at a time.
         each = (self.embedding(torch.cat([light, shared], 1)) / radiance.shape[1] for light in lights)

@@ -15,6 +15,7 @@ from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Output, State
 from mcdenoise.models._state import own_pair
 from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.ops._window import accumulator_dtype
 
 _GAMMA = 2.2
 
@@ -50,7 +51,9 @@ class Antialiased(Wrapper):
         """See :class:`mcdenoise.models.Model`."""
         inner, shown = own_pair(state, "antialiased")
         output, inner = self.inner(frame, inner)
-        image = _mapped(output.image)
+        dtype = output.image.dtype
+        # In half precision the exponents are rounded, too: both powers together were off by 2 %.
+        image = _mapped(output.image.to(accumulator_dtype(dtype)))
         before, weight, _ = reprojected(frame, shown, 3, "antialiased")
         low, high = _range(_to_ycocg(image))
         clamped = torch.minimum(torch.maximum(_to_ycocg(before), low), high)
@@ -58,7 +61,7 @@ class Antialiased(Wrapper):
         result = torch.where(weight > 0, blended, image)
         after = inner, Past.of(frame, result, surfaces=False)
         stages = {**output.stages, "denoised": output.image}
-        return output._replace(image=result**_GAMMA, stages=stages), after
+        return output._replace(image=(result**_GAMMA).to(dtype), stages=stages), after
 
 
 def _mapped(image: Tensor) -> Tensor:

@@ -85,7 +85,7 @@ class Asvgf(Svgf):
             return temporal_gradient(now, before, there, None, *surface)
         found, weight = reproject(past.image[:, -3:], motion, surface_before(frame), past.surface)
         moments, length = found[:, :2], found[:, 2:].clamp_min(1)
-        current = luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(moments.dtype)
+        current = luminance_moments(frame.color.to(moments.dtype).clamp_max(BRIGHTEST))
         spatial = moments_variance(current, *surface, kernel_size=WINDOW)
         noise = torch.maximum(variance_of(moments, length, frame), spatial)
         noise = noise * (1 + 1 / length.clamp_max(2 / self.alpha - 1))

@@ -50,6 +50,7 @@ from mcdenoise.models.exposed import Exposed
 from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.ops import upsample
+from mcdenoise.ops._window import accumulator_dtype
 
 STAGES, GROWTH, SLOPE = 5, 4 / 3, 0.1
 _TYPICAL = 0.5  # exposed radiance
@@ -141,7 +142,7 @@ def input_of(frame: Frame) -> Tensor:
     depth = one if frame.depth is None else normalize_depth(frame.depth)
     roughness = one if frame.roughness is None else frame.roughness
     parts = torch.log1p(frame.color), view_normal(frame), depth, roughness
-    return torch.cat([part.to(one.dtype) for part in parts], 1)
+    return torch.cat([part.to(accumulator_dtype(one.dtype)) for part in parts], 1)
 
 
 def view_normal(frame: Frame) -> Tensor:

@@ -21,6 +21,7 @@ from mcdenoise.models._interface import Needs, Output, State
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.with_oidn import CENTRED, NOISY
 from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops._window import accumulator_dtype
 
 # Sides of the windows over which the previous result is compared with this frame, and how much a difference equal to
 # the deviation of single samples reduces the logarithm of its weight.
@@ -67,11 +68,11 @@ class Steadied(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
-        image = frame.color
+        image = frame.color.to(accumulator_dtype(frame.color.dtype))
         noisy = frame.extra.get(NOISY, image)
         centred = frame.extra.get(CENTRED, torch.zeros_like(image[:, :1]))
         same = frame.extra.get(PREVIOUS_WEIGHT, torch.zeros_like(centred))
-        before, light = (frame.extra.get(name, image) for name in (PREVIOUS, PREVIOUS_LIGHT))
+        before, light = (frame.extra.get(name, image).to(image.dtype) for name in (PREVIOUS, PREVIOUS_LIGHT))
         before = torch.where(centred > 0, light, (before + light) / 2)
 
         # In the image's unit, because scaling it by the exposure would add a rounding error.
@@ -80,7 +81,7 @@ class Steadied(nn.Module):
         n = self.history * same
         for window, doubt in zip(_WINDOWS, _DOUBTS, strict=True):
             n = n * torch.exp(-doubt * _relative(before, image, same, window, least) / noise)
-        return Output(torch.lerp(image, before, n / (1 + n))), None
+        return Output(torch.lerp(image, before, n / (1 + n)).to(frame.color.dtype)), None
 
 
 def _relative(

@@ -25,6 +25,7 @@ from mcdenoise.models._motion import motion_to_previous, surface_before
 from mcdenoise.models._state import own_state
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import accumulate, atrous, luminance_moments, moments_variance
+from mcdenoise.ops._window import accumulator_dtype
 
 # With fewer frames, moments over time hardly determine the variance.
 _FEW_FRAMES, WINDOW = 4, 7
@@ -53,7 +54,8 @@ class Svgf(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         check_needs(self.needs, frame.buffers)
-        entering = with_carried(frame)
+        # Half precision represents no squares of bright light.
+        entering = with_carried(frame).to(accumulator_dtype(frame.color.dtype))
         # Light that was accumulated and filtered once, with layers and alpha; two moments; and the length, in frames.
         past = own_state(state, Past, frame, channels=entering.shape[1] + 3, keeper="svgf")
         reset = reset_of(frame, past and past.image, past and past.view_projection)
@@ -64,13 +66,13 @@ class Svgf(nn.Module):
             filtered, variance = atrous(filtered, variance, frame.normal, frame.depth, step=1 << level)  #  Eqs. 1 and 2
             # Sec. 4.3: the first level feeds the history.
             kept = filtered if level == 0 else kept
-        output = answered(frame, filtered).noted(Note("history", reset))
+        output = answered(frame, filtered.to(frame.color.dtype)).noted(Note("history", reset))
         after = Past.of(frame, torch.cat([kept, moments, length], 1))
-        return output._replace(stages={"accumulated": light[:, :3]}), after
+        return output._replace(stages={"accumulated": light[:, :3].to(frame.color.dtype)}), after
 
     def _accumulate(self, frame: Frame, light: Tensor, past: Past | None) -> tuple[Tensor, Tensor, Tensor]:
         """Sec. 4.1: light, moments and length with the history, where there is one."""
-        entering = torch.cat([light, luminance_moments(frame.color.clamp_max(BRIGHTEST)).to(light.dtype)], 1)
+        entering = torch.cat([light, luminance_moments(light[:, :3].clamp_max(BRIGHTEST))], 1)
         if past is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
         both, length = self._blend(frame, entering, past, motion_to_previous(frame, past.view_projection))

@@ -17,7 +17,7 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import LARGEST_RADIANCE
 from mcdenoise.nn.inputs import unit_features_of
-from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 # Logarithm of the radiance 3, albedo 3, normal 3, depth 1, and one over the number of averaged frames 1.
 CHANNELS = 11
@@ -47,7 +47,7 @@ def samples_of(frame: Frame) -> Tensor:
             "the first three are radiance"
         )
     # ``Frame.validate`` does not check every value of the samples.
-    light = frame.samples[:, :, :3].nan_to_num(0).clamp(0.0, LARGEST_RADIANCE)
+    light = frame.samples[:, :, :3].to(accumulator_dtype(color.dtype)).nan_to_num(0).clamp(0.0, LARGEST_RADIANCE)
     return light if frame.length is None else torch.cat([light, color.to(light.dtype)], 1)
 
 

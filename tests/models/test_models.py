@@ -207,6 +207,24 @@ def test_exposure_only_scales_the_result(name: str, factor: float, bare: bool) -
         torch.testing.assert_close(scaled.image / factor, result.image, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+@pytest.mark.parametrize("name", sorted(set(KINDS) - {"oidn"}))
+@torch.no_grad()
+def test_half_precision_rounds_only_the_result(name: str, dtype: torch.dtype) -> None:
+    """Of light whose squares overflow, and of dim light."""
+    model = small(name)
+    for factor in (1000, 2.0**-12):
+        states: list[Any] = [None, None]
+        for seed in range(2):
+            frame = whole_frame(model, 24, 40, seed=seed)
+            frame = frame.replace(color=frame.color * factor).to(dtype)
+            rounded, states[0] = model(frame, states[0])
+            exact, states[1] = model(frame.to(torch.float32), states[1])
+            assert rounded.image.dtype == dtype
+            error = (rounded.image.float() - exact.image).abs().mean() / exact.image.mean()
+            assert error < torch.finfo(dtype).eps, (factor, seed)
+
+
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 @pytest.mark.parametrize("name", TRAINABLE)
 @torch.no_grad()

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._rows import by_rows
-from mcdenoise.ops._window import pad
+from mcdenoise.ops._window import accumulator_dtype, pad
 
 __all__ = ["CELL", "REACH", "weight_of_noisy"]
 
@@ -35,7 +35,8 @@ def weight_of_noisy(color: Tensor, image: Tensor) -> Tensor:
     Returns:
         ``(B, 1, H, W)`` in [0, 1]. A pixel depends on those up to :data:`REACH` pixels away.
     """
-    return by_rows(_weight, color, image, reach=REACH)
+    dtype = accumulator_dtype(color.dtype)
+    return by_rows(_weight, color.to(dtype), image.to(dtype), reach=REACH).to(color.dtype)
 
 
 def _weight(color: Tensor, image: Tensor) -> Tensor:
