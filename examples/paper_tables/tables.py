@@ -200,7 +200,7 @@ def table_1(measured: Measured) -> Table:
     for name, errors in every.items():
         cells = [found.cells(each) for each in [*errors, averages[name]]]
         found.rows += [[name, protocol, *(own[i] for own in cells)] for i, protocol in enumerate(PROTOCOL_NAMES)]
-    for name in (*RIVALS, "SVGF", "OIDN"):
+    for name in (*RIVALS, *OTHERS, "SVGF", "OIDN"):
         found.claim(f"P+K is ahead of {name}", every["P+K"], every[name])
     found.claim("the final image is ahead of the initial one", every["P+K"], every["P+K, initial"])
     return found

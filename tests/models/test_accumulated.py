@@ -75,7 +75,7 @@ def test_a_cut_resets() -> None:
 
 @pytest.mark.parametrize("in_graph", [False, True])
 def test_each_image_of_a_batch_is_a_shot_of_its_own(in_graph: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One stands still, before a camera off the centre of its pixels, one moves, and one cuts to caustics."""
+    """One stands still, one moves, and one cuts to caustics."""
     if in_graph:
         monkeypatch.setattr("mcdenoise.models.accumulated.at_hand", lambda device: False)
         monkeypatch.setattr("mcdenoise.models._motion.at_hand", lambda device: False)
@@ -95,7 +95,7 @@ def test_each_image_of_a_batch_is_a_shot_of_its_own(in_graph: bool, monkeypatch:
     shots[2][2:] = [frame.replace(color=caustics(0.3).color) for frame in shots[2][2:]]
     together, alone = images(model, shots), torch.cat([images(model, [shot]) for shot in shots], 1)
     torch.testing.assert_close(together[:, 1:], alone[:, 1:])
-    # A history that is projected to where it was is blurred.
+    # Where nothing moved, no projection rounds the motion.
     assert torch.equal(together[:, 0], alone[:, 0])
 
 
