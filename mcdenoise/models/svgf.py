@@ -21,7 +21,7 @@ from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reset_of
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._motion import motion_to_previous, surface_before
+from mcdenoise.models._motion import motion_unless_still, surface_before
 from mcdenoise.models._state import own_state
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import accumulate, atrous, luminance_moments, moments_variance
@@ -75,7 +75,7 @@ class Svgf(nn.Module):
         entering = torch.cat([light, luminance_moments(light[:, :3].clamp_max(BRIGHTEST))], 1)
         if past is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
-        both, length = self._blend(frame, entering, past, motion_to_previous(frame, past.view_projection))
+        both, length = self._blend(frame, entering, past, motion_unless_still(frame, past.view_projection))
         return both[:, :-2], both[:, -2:], length
 
     def _blend(self, frame: Frame, entering: Tensor, past: Past, motion: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -1,10 +1,12 @@
 """SVGF: what its accumulation, its variance and its transform promise."""
 
+import pytest
 import torch
 from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
+from mcdenoise.models import create_model
 from mcdenoise.models._history import Past
 from mcdenoise.models.svgf import Svgf, variance_of
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
@@ -43,6 +45,17 @@ def test_the_weight_of_a_frame_is_one_over_their_number_down_to_alpha() -> None:
         _, moments, length = kept(state)
         torch.testing.assert_close(moments, rest * torch.tensor([2.0, 4.0]).reshape(1, 2, 1, 1).expand_as(moments))
         assert length.unique().tolist() == [number]
+
+
+@pytest.mark.parametrize("name", ["svgf", "asvgf"])
+def test_a_still_camera_moves_nothing(name: str) -> None:
+    """Positions, which a renderer takes anywhere in a pixel, would be projected to the pixels beside it."""
+    first, second = (frame(seed=seed, position=torch.rand(1, 3, HEIGHT, WIDTH)) for seed in (0, 1))
+    model, images = create_model(name), []
+    for changes in ({}, {"motion": None, "view_projection": torch.eye(4)[None]}):
+        given = [each.replace(**changes, previous_position=each.position) for each in (first, second)]
+        images.append(model(given[1], model(given[0])[1])[0].image)
+    assert torch.equal(*images)
 
 
 def test_the_first_level_feeds_the_history() -> None:
