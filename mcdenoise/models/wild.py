@@ -96,14 +96,19 @@ class Trust(nn.Module):
         images = [image.clamp_max(MAX_RADIANCE) for image in (alone, recent, color)]
         light = torch.cat([image.mean(1, keepdim=True) for image in images], 1)
         shown = torch.cat([image.mean(1, keepdim=True) for image in (*map(compress, images), albedo)], 1)
-        lengths = normal.square().sum(1, keepdim=True)
-        each = torch.cat([shown, shown.square(), _apart(shown), part, lengths, normal, light], 1)
-        blocks = F.avg_pool2d(up_to_multiple(each, _BLOCK, "replicate"), _BLOCK)
-        means, squares, apart, part, lengths, normal, light = blocks.split([4, 4, 3, 1, 1, 3, 3], 1)
+        each = torch.cat([shown, normal, _apart(shown), part, light], 1)
+        each = up_to_multiple(each, _BLOCK, "replicate")
+        means, apart, part, light = F.avg_pool2d(each, _BLOCK).split([7, 3, 1, 3], 1)
+        # Not mean squares less squared means: in half precision nothing is left of them where a block is even.
+        deviations = each[:, :7] - F.interpolate(means, scale_factor=_BLOCK)
+        variances, of_normal = F.avg_pool2d(deviations.square(), _BLOCK).split([4, 3], 1)
+        means, normal = means.split([4, 3], 1)
+        of_normal = of_normal.sum(1, keepdim=True)
+        lengths = of_normal + normal.square().sum(1, keepdim=True)
         # Means of radiance, which noise does not change.
         far = _apart(compress(F.avg_pool2d(light, 4, ceil_mode=True, count_include_pad=False)))
         far = corner(F.interpolate(far, scale_factor=4, mode="bilinear", align_corners=False), *part.shape[-2:])
-        variances = torch.cat([squares - means.square(), lengths - normal.square().sum(1, keepdim=True)], 1)
+        variances = torch.cat([variances, of_normal], 1)
         differences = torch.cat([apart, _apart(means), far, variances.clamp_min(_LEAST**2).sqrt()], 1)
         seen = [means[:, :3], (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
         logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
