@@ -100,8 +100,9 @@ class Trust(nn.Module):
         each = up_to_multiple(each, _BLOCK, "replicate")
         means, apart, part, light = F.avg_pool2d(each, _BLOCK).split([7, 3, 1, 3], 1)
         # Not mean squares less squared means: in half precision nothing is left of them where a block is even.
-        deviations = each[:, :7] - F.interpolate(means, scale_factor=_BLOCK)
-        variances, of_normal = F.avg_pool2d(deviations.square(), _BLOCK).split([4, 3], 1)
+        pixels = each[:, :7].unflatten(3, (-1, _BLOCK)).unflatten(2, (-1, _BLOCK))
+        squares = (pixels - means[:, :, :, None, :, None]).square().flatten(4).flatten(2, 3)
+        variances, of_normal = F.avg_pool2d(squares, _BLOCK).split([4, 3], 1)
         means, normal = means.split([4, 3], 1)
         of_normal = of_normal.sum(1, keepdim=True)
         lengths = of_normal + normal.square().sum(1, keepdim=True)
