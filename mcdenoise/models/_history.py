@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -73,7 +73,7 @@ def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None)
 
 
 def reprojected(
-    frame: Frame, state: State, channels: int, keeper: str, *, sharp: bool = False, **rule: Any
+    frame: Frame, state: State, channels: int, keeper: str, *, sharp: bool = False
 ) -> Reprojected:
     """Reproject the images of the frame before to this frame.
 
@@ -83,7 +83,6 @@ def reprojected(
         channels: number of channels of the image.
         keeper: name of the method for messages.
         sharp: whether pixels whose four nearest show the same surface are resampled by bicubic interpolation.
-        rule: how surfaces are compared, see :func:`mcdenoise.ops.reproject`; by default as far as both have them.
 
     Raises:
         InputError: the state belongs to another method.
@@ -94,8 +93,8 @@ def reprojected(
         shape = (frame.color.shape[0], channels, *frame.size)
         none = torch.zeros_like(frame.color[:, :1])
         return Reprojected(frame.color.new_zeros(shape), none, _notes(frame, reset, 0.0))
-    motion, surfaces = motion_unless_still(frame, before.view_projection), (surface_before(frame), before.surface)
-    found, weight = reproject(before.image, motion, *(surfaces if rule else comparable(*surfaces)), **rule)
+    motion = motion_unless_still(frame, before.view_projection)
+    found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     if sharp and motion is not None:
         whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps
         found = torch.where(whole, resample(before.image, motion), found)

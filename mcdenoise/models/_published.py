@@ -21,36 +21,26 @@ from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.inputs import image_statistics, unit_features_of
 from mcdenoise.ops import remodulate
 
-# Squared distance for the BMFR scene "classroom" in scene units (metres).
-POSITION_LIMIT, NORMAL_LIMIT = 0.01, 1.0
 # Darker radiance is raised to this value before the power function, whose derivative at zero is infinite.
 _DARKEST = 1e-6
 
 
-def as_published(
-    method: Model,
-    alpha_min: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
-) -> Model:
-    """Wrap a method with demodulation and the published accumulation rule (Koskela et al. 2019), and nothing else.
+def as_published(method: Model, alpha_min: float = 0.2) -> Model:
+    """Wrap a method with demodulation and the published accumulation (Koskela et al. 2019), and nothing else.
+
+    The weights are the published ones. The consistency test is that of :func:`mcdenoise.ops.reproject`, whose limits
+    are relative to the depth: those of the authors are in scene units, chosen for each scene, and need positions.
 
     Diffuse and specular light are accumulated for a method that uses them.
 
     Args:
         method: any.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1].
-        position_limit: squared distance in scene units below which two points count as the same point, see
-            :func:`mcdenoise.ops.reproject`.
-        normal_limit: the same for normals.
     """
     return Demodulated(
         Accumulated(
             method,
             alpha_min=alpha_min,
-            rule="bmfr",
-            position_limit=position_limit,
-            normal_limit=normal_limit,
             firefly_limit=float("inf"),
             specular_length=float("inf"),
             lag_threshold=float("inf"),
@@ -62,20 +52,17 @@ def as_published(
 def published(network: Callable[..., Model]) -> Callable[..., Model]:
     """A constructor of a network, or of a chain of tiled ones, behind exposure and :func:`as_published`.
 
-    A model's settings are then those of the network, which determine its weights, and by keyword ``alpha_min``,
-    ``position_limit`` and ``normal_limit``.
+    A model's settings are then those of the network, which determine its weights, and by keyword ``alpha_min``.
     """
+    alpha = inspect.signature(as_published).parameters["alpha_min"]
 
     @functools.wraps(network, updated=())
-    def made(*sizes: Any, **named: Any) -> Model:
-        history = {name: named.pop(name) for name in accumulation if name in named}
+    def made(*sizes: Any, alpha_min: float = alpha.default, **named: Any) -> Model:
         inner = network(*sizes, **named)
-        return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), **history)
+        return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), alpha_min)
 
-    _, *settings = inspect.signature(as_published).parameters.values()
-    accumulation = {each.name: each.replace(kind=each.KEYWORD_ONLY) for each in settings}
     own = inspect.signature(network)
-    every = [*own.parameters.values(), *accumulation.values()]
+    every = [*own.parameters.values(), alpha.replace(kind=alpha.KEYWORD_ONLY)]
     made.__signature__ = own.replace(parameters=every)  # type: ignore[attr-defined]
     return made
 

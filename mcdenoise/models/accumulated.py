@@ -34,7 +34,6 @@ from mcdenoise.ops._steps.history import (
 )
 from mcdenoise.ops.fireflies import LIMIT
 from mcdenoise.ops.lag import THRESHOLD
-from mcdenoise.ops.temporal import Rule
 
 # A cut leaves a few accidental matches; a fast pan keeps far more than this fraction of the image.
 CUT_FRACTION = 0.05
@@ -161,9 +160,6 @@ class Accumulated(Wrapper):
     Args:
         inner: any method.
         alpha_min: smallest weight of the current frame, in (0, 1], see :func:`mcdenoise.ops.accumulate`.
-        rule: ``"relative"``; or ``"bmfr"``, the published one, which needs positions and normals.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: likewise.
         firefly_limit: see :func:`mcdenoise.ops.clamp_fireflies`, infinity for none; by default chosen as above.
         specular_length: the longest history of mirrors and glass while the image moves, in frames, at least 0; infinity
             treats them as everything else.
@@ -185,9 +181,6 @@ class Accumulated(Wrapper):
         inner: Model,
         *,
         alpha_min: float = 0.1,
-        rule: Rule = "relative",
-        position_limit: float | None = None,
-        normal_limit: float | None = None,
         firefly_limit: float | None = None,
         specular_length: float = SPECULAR_LENGTH,
         lag_threshold: float = THRESHOLD,
@@ -198,8 +191,7 @@ class Accumulated(Wrapper):
             raise InputError(f"alpha_min: expected in (0, 1], found {alpha_min}")
         if not specular_length >= 0:
             raise InputError(f"specular_length: expected at least 0, found {specular_length}")
-        self.alpha_min, self.rule, self.firefly_limit = alpha_min, rule, firefly_limit
-        self.position_limit, self.normal_limit = position_limit, normal_limit
+        self.alpha_min, self.firefly_limit = alpha_min, firefly_limit
         self.specular_length, self.lag_threshold = specular_length, lag_threshold
         self.also = tuple(also)
 
@@ -252,9 +244,6 @@ class Accumulated(Wrapper):
 
     def _reset(self, frame: Frame, history: History | None) -> str:
         """Why the frame cannot have this history; empty if it can, unless there is a cut."""
-        surfaces = (frame, frame if history is None else history.surface)
-        if self.rule == "bmfr" and any(each.position is None or each.normal is None for each in surfaces):
-            return "no position and normal, which the rule compares"
         if history is None:
             return reset_of(frame, None, None)
         return reset_of(frame, history.length, history.view_projection) or self._other_buffers(history, frame)
@@ -355,15 +344,10 @@ class Accumulated(Wrapper):
         motion: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Color and length of the frame with its history, and how many pixels of each image have one."""
-        surface, previous = surface_before(frame)._replace(label=seen), history.surface
-        if self.rule == "relative":
-            surface, previous = comparable(surface, previous)
+        surface, previous = comparable(surface_before(frame)._replace(label=seen), history.surface)
         return blend(
             *(entering, before, history.length, motion, surface, previous),
             alpha_min=self.alpha_min,
-            rule=self.rule,
-            position_limit=self.position_limit,
-            normal_limit=self.normal_limit,
             albedo=frame.albedo,
             specular_length=self.specular_length,
             lag_threshold=self.lag_threshold,

@@ -3,9 +3,8 @@
 Koskela et al. 2019, "Blockwise Multi-Order Feature Regression for Real-Time Path-Tracing Reconstruction", ACM
 Transactions on Graphics 38(5), and its public code, ``bmfr.cl``. The steps are:
 
-1. Demodulated radiance is accumulated by the BMFR rule, with the weight ``max(1 / n, 0.2)`` of the current frame
-   (:class:`mcdenoise.models.Accumulated`, ``rule="bmfr"``). The limits of the rule are in scene units, and the authors
-   chose them for each scene: the defaults are their values for "classroom".
+1. Demodulated radiance is accumulated with the weight ``max(1 / n, 0.2)`` of the current frame
+   (:class:`mcdenoise.models.Accumulated`).
 2. Blocks of 32x32 pixels, whose origin cycles through 16 offsets from frame to frame, are fitted by 1, the normal, the
    position, and the squares of the position (:func:`mcdenoise.ops.block_regression`). Negative results are clamped to
    0.
@@ -15,6 +14,7 @@ Transactions on Graphics 38(5), and its public code, ``bmfr.cl``. The steps are:
 
 Differences from the public code:
 
+- The limits of its consistency test are in scene units, chosen for each scene. Here they are relative to the depth.
 - The code adds noise of +-0.01 to the features, different in every frame, to make them linearly independent. Here a
   ridge does this, so that the result of a frame is reproducible. The ridge is as small as float32's rounding, so that
   radiance that is linear in the features is preserved.
@@ -30,7 +30,7 @@ Layers and alpha are fitted, accumulated and clamped at 0 together with the colo
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -42,7 +42,7 @@ from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import NORMAL_LIMIT, POSITION_LIMIT, as_published
+from mcdenoise.models._published import as_published
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import block_regression
@@ -73,12 +73,10 @@ class History(NamedTuple):
 class Bmfr(nn.Module):
     """Fits accumulated radiance by the features of each block, and accumulates the result.
 
-    It has to be wrapped in :class:`mcdenoise.models.Accumulated` with the same limits.
+    It has to be wrapped in :class:`mcdenoise.models.Accumulated`.
 
     Args:
         second_alpha: smallest weight of the current frame in the second accumulation, in (0, 1].
-        position_limit: see :func:`mcdenoise.ops.reproject`, rule "bmfr".
-        normal_limit: the same for normals.
 
     Raises:
         InputError: a setting is out of its range.
@@ -86,18 +84,11 @@ class Bmfr(nn.Module):
 
     _starts: Tensor
 
-    def __init__(
-        self,
-        *,
-        second_alpha: float = 0.1,
-        position_limit: float = POSITION_LIMIT,
-        normal_limit: float = NORMAL_LIMIT,
-    ) -> None:
+    def __init__(self, *, second_alpha: float = 0.1) -> None:
         super().__init__()
         if not 0 < second_alpha <= 1:
             raise InputError(f"second_alpha: expected in (0, 1], found {second_alpha}")
         self.second_alpha, self.persistence = second_alpha, 1 - second_alpha
-        self.limits: dict[str, Any] = {"position_limit": position_limit, "normal_limit": normal_limit}
         self.register_buffer("_starts", torch.tensor(STARTS), persistent=False)
         buffers = frozenset({"color", "normal", "position", "length"})
         self.needs = Needs(buffers, MOTION - {"position"} | {"view_projection"}, trainable=False)
@@ -111,9 +102,7 @@ class Bmfr(nn.Module):
         images = self._fitted(frame, light, number)
         fitted = images[:, :3]
         # Over the taps and with the length of the first accumulation.
-        before, weight, _ = reprojected(
-            frame, history and history.past, light.shape[1], "bmfr", rule="bmfr", **self.limits
-        )
+        before, weight, _ = reprojected(frame, history and history.past, light.shape[1], "bmfr")
         assert frame.length is not None
         alpha = torch.where(weight > 0, (1 / frame.length).clamp_min(self.second_alpha), 1)
         images = torch.lerp(before.to(images.dtype), images, alpha.to(images.dtype))
@@ -161,8 +150,6 @@ def bmfr(
     second_alpha: float = 0.1,
     taa: bool = True,
     taa_alpha: float = 0.2,
-    position_limit: float = POSITION_LIMIT,
-    normal_limit: float = NORMAL_LIMIT,
 ) -> Model:
     """Blockwise multi-order feature regression (Koskela et al. 2019), with its accumulations and anti-aliasing.
 
@@ -171,10 +158,6 @@ def bmfr(
         second_alpha: the same for the second accumulation.
         taa: whether the result is temporally anti-aliased, as published.
         taa_alpha: weight of the current frame in the anti-aliasing, in (0, 1].
-        position_limit: squared distance in scene units below which two points count as the same point, see
-            :func:`mcdenoise.ops.reproject`.
-        normal_limit: the same for normals.
     """
-    fit = Bmfr(second_alpha=second_alpha, position_limit=position_limit, normal_limit=normal_limit)
-    model = as_published(fit, alpha_min, position_limit, normal_limit)
+    model = as_published(Bmfr(second_alpha=second_alpha), alpha_min)
     return Antialiased(model, alpha=taa_alpha) if taa else model

@@ -8,8 +8,8 @@ The paper is doi:10.1007/s00371-023-02951-6; equation numbers refer to it. It le
 - f1, f2, f3 >= 0: a softplus;
 - the unit of radiance: typical radiance is scaled to 0.5 (:class:`mcdenoise.models.Exposed`);
 - depth in [0, 1]: ``d / (d + typical depth)``;
-- accumulation (its Appendix 1): the published rule of Koskela et al. 2019 with alpha 0.2, on demodulated radiance; it
-  compares positions in scene units;
+- accumulation (its Appendix 1): that of Koskela et al. 2019 with alpha 0.2, on demodulated radiance, with limits of the
+  consistency test that are relative to the depth (:func:`mcdenoise.models._published.as_published`);
 - negative radiance, which Eq. 2 allows: the result is clamped at 0.
 """
 

@@ -22,7 +22,7 @@ Differences, and choices where paper and code leave something open:
 - the unit of radiance: typical radiance is scaled to 0.5 (:class:`mcdenoise.models.Exposed`);
 - depth in [0, 1] is ``d / (d + typical depth)``; the code scales each frame's depth to that range;
 - negative radiance, which negative weights allow, is clamped to 0;
-- accumulation: the published rule of Koskela et al. 2019 with alpha 0.2, on demodulated radiance, as in Meng's data;
+- accumulation: that of Koskela et al. 2019 with alpha 0.2, on demodulated radiance, as in Meng's data;
 - derivatives: the derivative of the gamma curve is unbounded at black, and is 0 below 1e-6 here. As in the code,
   derivatives in a guide above 100 are set to 0 in training: they occur where only the tail of a tent reaches a cell,
   and carry no information;

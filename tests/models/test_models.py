@@ -641,5 +641,5 @@ def test_weights_fit_with_and_without_wrappers(weights: Path) -> None:
     """A file holds the networks' weights alone: what is around them is not of its business."""
     names = set(load_file(weights))
     assert all(name.startswith(("initial.", "final.")) for name in names)
-    loaded = load_weights(weights, alpha_min=0.3, position_limit=0.1)
+    loaded = load_weights(weights, alpha_min=0.3)
     assert [part.alpha_min for part in parts_of(loaded, Accumulated)] == [0.3]
