@@ -72,9 +72,7 @@ def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None)
     return "" if told else NO_MOTION
 
 
-def reprojected(
-    frame: Frame, state: State, channels: int, keeper: str, *, sharp: bool = False
-) -> Reprojected:
+def reprojected(frame: Frame, state: State, channels: int, keeper: str, *, sharp: bool = False) -> Reprojected:
     """Reproject the images of the frame before to this frame.
 
     Args:
