@@ -263,21 +263,13 @@ def _history(function: Any) -> Op:
     def smooth(*names: str) -> tuple[str, ...]:
         return tuple(name for name in names if name in arguments)
 
-    def lasting(draw: Draw, **given: Any) -> dict[str, Any]:
-        """The length of the history, for the op that has one."""
-        return {"previous_length": draw, **given} if accumulating else {}
-
     everything = smooth("color", "previous", "previous_length", "motion")
-    # "bmfr" rounds the length, which then has no derivative.
-    but_length = smooth("color", "previous", "motion")
-    bmfr = {"rule": "bmfr", "change": _buffers("position", "normal"), "position_limit": 0.5, "normal_limit": 0.25}
     return checked(
         function,
         arguments | surfaces,
-        ordinary("relative, all buffers, labels", (1, 3, 3, 3), uniform),
-        ordinary("relative, position and depth", (1, 1, 3, 3), uniform, change=_buffers("position", "depth")),
-        ordinary("relative, normal", (1, 1, 3, 3), uniform, change=_buffers("normal"), normal_limit=0.3),
-        ordinary("bmfr", (1, 3, 3, 3), uniform, but_length, **bmfr, **lasting(between(1, 3.4), alpha_min=0.2)),
+        ordinary("all buffers, labels", (1, 3, 3, 3), uniform),
+        ordinary("position and depth", (1, 1, 3, 3), uniform, change=_buffers("position", "depth")),
+        ordinary("normal", (1, 1, 3, 3), uniform, change=_buffers("normal"), normal_limit=0.3),
         # Zero is a whole pixel, where the derivative in the motion jumps.
         ordinary("still", (1, 3, 2, 3), uniform, smooth("color", "previous", "previous_length"), motion=constant(0)),
         extreme("out of the image", (1, 3, 2, 3), uniform, everything, change=_far_out, **alone),
@@ -291,7 +283,6 @@ def _history(function: Any) -> Op:
         *(
             (
                 ordinary("long history", (1, 1, 3, 3), uniform, previous_length=between(12, 40), **alone),
-                extreme("a byte, bmfr", (1, 1, 3, 3), uniform, previous_length=between(250, 255), **bmfr),
                 extreme("1e4 frames, never forgotten", previous_length=constant(1e4), alpha_min=1e-6, **alone),
             )
             if accumulating

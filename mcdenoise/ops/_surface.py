@@ -1,14 +1,12 @@
-"""The buffers that tell one surface from another in two frames, and the rules to compare them."""
+"""The buffers that tell one surface from another in two frames."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
-
-Rule = Literal["relative", "bmfr"]
 
 
 class Surface(NamedTuple):
@@ -38,20 +36,8 @@ def comparable(surface: Surface | None, previous: Surface | None) -> tuple[Surfa
     return Surface(*(a for a, _ in pairs)), Surface(*(b for _, b in pairs))
 
 
-def check_surfaces(
-    previous: Tensor,
-    surface: Surface | None,
-    previous_surface: Surface | None,
-    rule: str,
-    position_limit: float | None,
-    normal_limit: float | None,
-) -> None:
-    """``TypeError`` or ``ValueError`` for surfaces that cannot be compared by a rule.
-
-    A buffer that a rule requires must not be missing silently: the rule would accept everything.
-    """
-    if rule not in ("relative", "bmfr"):
-        raise ValueError(f"rule: expected 'relative' or 'bmfr', found {rule!r}")
+def check_surfaces(previous: Tensor, surface: Surface | None, previous_surface: Surface | None) -> None:
+    """``TypeError`` or ``ValueError`` for surfaces that cannot be compared."""
     if surface is None or previous_surface is None:
         return
     here, there = comparable(surface, previous_surface)
@@ -61,12 +47,5 @@ def check_surfaces(
                 previous=(previous, "B C H W"),
                 **{f"surface.{name}": (a, f"B {channels} H W"), f"previous_surface.{name}": (b, f"B {channels} H W")},
             )
-    if rule == "bmfr":
-        for name, buffer in (("position", here.position), ("normal", here.normal)):
-            if buffer is None:
-                raise ValueError(f"surface.{name}: the rule 'bmfr' needs it in both frames, found None")
-        for name, limit in (("position_limit", position_limit), ("normal_limit", normal_limit)):
-            if limit is None:
-                raise ValueError(f"{name}: the rule 'bmfr' needs the scene's squared limit, found None")
-    elif here.position is not None and here.depth is None:
-        raise ValueError("surface.depth: the rule 'relative' needs it beside position in both frames, found None")
+    if here.position is not None and here.depth is None:
+        raise ValueError("surface.depth: expected it beside position in both frames, found None")

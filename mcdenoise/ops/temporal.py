@@ -10,11 +10,10 @@ from mcdenoise.ops._constants import DEPTH_LIMIT, LABEL_WEIGHT, NORMAL_LIMIT_SQU
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
-from mcdenoise.ops._surface import Rule, Surface, check_surfaces, comparable
+from mcdenoise.ops._surface import Surface, check_surfaces, comparable
 
 __all__ = [
     "Accumulate",
-    "Rule",
     "Surface",
     "accumulate",
     "check_accumulate",
@@ -77,7 +76,6 @@ def reproject(
     surface: Surface | None = None,
     previous_surface: Surface | None = None,
     *,
-    rule: Rule = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -89,12 +87,12 @@ def reproject(
 
     The test compares whatever both surfaces have:
 
-    - ``rule="relative"``: limits scale with depth. ``|dot(P_k - P, N)| <= position_limit * depth``, the distance off
-      the tangent plane (``|P_k - P|`` without normals; default 0.02); with depths only,
-      ``|d_k - d| <= position_limit * d`` (default 0.1); ``|N_k - N|^2 <= normal_limit`` (default 0.5). Positions
-      need depths beside them. A pixel that hit nothing matches only such pixels.
-    - ``rule="bmfr"``: ``|P_k - P|^2 < position_limit`` and ``|N_k - N|^2 < normal_limit``, squared limits in scene
-      units, which the scene must supply; positions and normals are needed.
+    - positions: ``|dot(P_k - P, N)| <= position_limit * depth``, the distance off the tangent plane (``|P_k - P|``
+      without normals; default 0.02). They need depths beside them;
+    - depths alone: ``|d_k - d| <= position_limit * d`` (default 0.1); a pixel that hit nothing matches only such ones;
+    - normals: ``|N_k - N|^2 <= normal_limit`` (default 0.5).
+
+    The published rule has limits in scene units, which the scene must supply.
 
     A label is a preference: of the taps that pass, those of the pixel's own label are kept if they weigh more than
     0.001 together, else all of them. So a label that is wrong now and then shortens no history.
@@ -106,9 +104,8 @@ def reproject(
             against itself, and the result is, bit by bit, that of a motion of zeros.
         surface: the current frame's surface; ``None`` tests only for the image border.
         previous_surface: the previous frame's surface.
-        rule: ``"relative"`` or ``"bmfr"``.
-        position_limit: see above; required by ``"bmfr"``.
-        normal_limit: see above; required by ``"bmfr"``.
+        position_limit: see above.
+        normal_limit: see above.
 
     Returns:
         ``(B, C, H, W)`` value in the dtype of ``previous``, and ``(B, 1, H, W)`` kept weight in [0, 1].
@@ -117,7 +114,7 @@ def reproject(
 
     Raises:
         TypeError: an argument is no floating-point tensor.
-        ValueError: shapes disagree, the rule is unknown, or it lacks a buffer or a limit that it needs.
+        ValueError: shapes disagree, or there are positions without depths.
 
     Differentiable in ``previous`` (to any order) and, between the pixel centres, in ``motion``; the test is a
     decision and has no derivative. Without a test it is ``kornia.geometry.transform.remap`` inside the image.
@@ -132,11 +129,10 @@ def reproject(
         ([1.5, 2.5, 3.0], [1.0, 1.0, 0.5])
     """
     here, there = comparable(surface, previous_surface)
-    test = _bmfr_test if rule == "bmfr" else _relative_test
     dtype = torch.promote_types(previous.dtype, torch.float32)
     there = Surface(*(None if buffer is None else buffer.to(dtype) for buffer in there))
     if motion is None:
-        kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & test(here, there, position_limit, normal_limit)
+        kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & _alike(here, there, position_limit, normal_limit)
         return torch.where(kept, previous, 0), kept.to(previous.dtype)
     height, width = previous.shape[-2:]
 
@@ -159,7 +155,7 @@ def reproject(
                 tap = stack.gather(2, index.expand(-1, stack.shape[1], -1)).reshape(*stack.shape[:2], height, width)
                 parts = iter(torch.split(tap, [buffer.shape[1] for buffer in tested], 1))
                 tap_surface = Surface(*(None if buffer is None else next(parts) for buffer in there))
-            kept = kept & test(here, tap_surface, position_limit, normal_limit)
+            kept = kept & _alike(here, tap_surface, position_limit, normal_limit)
             bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
             if here.label is not None:
                 alike.append(kept & (tap_surface.label == here.label.to(dtype)))
@@ -192,7 +188,6 @@ def check_accumulate(
     previous_surface: Surface | None = None,
     *,
     alpha_min: float = 0.1,
-    rule: str = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> None:
@@ -205,7 +200,7 @@ def check_accumulate(
     )
     if not 0 < alpha_min <= 1:
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
-    check_surfaces(previous, surface, previous_surface, rule, position_limit, normal_limit)
+    check_surfaces(previous, surface, previous_surface)
 
 
 @op("numba", check=check_accumulate)
@@ -218,7 +213,6 @@ def accumulate(
     previous_surface: Surface | None = None,
     *,
     alpha_min: float = 0.1,
-    rule: Rule = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -226,8 +220,8 @@ def accumulate(
 
     With the reprojected history ``h`` and its length ``n`` (:func:`reproject`),
     ``alpha = max(1 / (n + 1), alpha_min)``, ``accumulated = alpha color + (1 - alpha) h`` and ``length = n + 1``;
-    where no tap is kept, ``accumulated = color`` and ``length = 1``. With ``rule="bmfr"`` the length is rounded before
-    1 is added and saturates at 255, as in the published code, which stores it in a byte (and uses ``alpha_min=0.2``).
+    where no tap is kept, ``accumulated = color`` and ``length = 1``. The published code has ``alpha_min=0.2``, and
+    rounds the length to a byte.
 
     Args:
         color: ``(B, C, H, W)`` noisy radiance of the current frame, usually demodulated.
@@ -238,7 +232,6 @@ def accumulate(
         surface: see :func:`reproject`.
         previous_surface: see :func:`reproject`.
         alpha_min: smallest weight of the current frame, in (0, 1].
-        rule: see :func:`reproject`.
         position_limit: see :func:`reproject`.
         normal_limit: see :func:`reproject`.
 
@@ -252,8 +245,7 @@ def accumulate(
         TypeError: an argument is no floating-point tensor.
         ValueError: shapes disagree, ``alpha_min`` is outside (0, 1], or as in :func:`reproject`.
 
-    Differentiable in ``color``, ``previous``, ``previous_length`` (not with ``"bmfr"``, which rounds it) and
-    ``motion``, to any order.
+    Differentiable in ``color``, ``previous``, ``previous_length`` and ``motion``, to any order.
 
     Source: Koskela et al. 2019 (BMFR), ``accumulate_noisy_data``.
 
@@ -270,7 +262,6 @@ def accumulate(
         motion,
         surface,
         previous_surface,
-        rule=rule,
         position_limit=position_limit,
         normal_limit=normal_limit,
     )
@@ -279,8 +270,7 @@ def accumulate(
     alpha = torch.where(found, (1 / (length + 1)).clamp_min(alpha_min), 1)
     accumulated = torch.lerp(history, color.to(dtype), alpha)
     accumulated = torch.where(found, accumulated, color.to(dtype))
-    length = (length.round() + 1).clamp_max(255) if rule == "bmfr" else length + 1
-    length = torch.where(found, length, 1)
+    length = torch.where(found, length + 1, 1)
     return accumulated.to(color.dtype), length.to(previous_length.dtype)
 
 
@@ -317,17 +307,7 @@ def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtyp
     return create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype).permute(0, 3, 1, 2)
 
 
-def _bmfr_test(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:
-    kept: Tensor | bool = True
-    for a, b, limit in ((here.position, tap.position, position_limit), (here.normal, tap.normal, normal_limit)):
-        if a is not None and b is not None and limit is not None:
-            kept = kept & ((b - a).square().sum(1, keepdim=True) < limit)
-    return kept
-
-
-def _relative_test(
-    here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None
-) -> Tensor | bool:
+def _alike(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:
     kept: Tensor | bool = True
     if here.normal is not None and tap.normal is not None:
         limit = NORMAL_LIMIT_SQUARED if normal_limit is None else normal_limit

@@ -239,14 +239,11 @@ ACCUMULATE, REPROJECT = (next(op for op in OPS if op.name == name) for name in (
 
 
 @pytest.mark.parametrize("op", [ACCUMULATE, REPROJECT], ids=lambda op: op.name)
-@pytest.mark.parametrize("rule", ["relative", "bmfr"])
-def test_histories_of_any_layout_and_by_any_number_of_threads(
-    rule: Any, op: Op, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_histories_of_any_layout_and_by_any_number_of_threads(op: Op, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_runtime, "PIXELS_A_THREAD", 1)
     case = next(case for case in op.cases if "all buffers" in case.name)
     inputs = case.inputs()
-    limits: dict[str, Any] = {"rule": rule, "position_limit": 0.05, "normal_limit": 0.3}
+    limits: dict[str, Any] = {"position_limit": 0.05, "normal_limit": 0.3}
     plain = by("torch", op.function)(**inputs, **limits)
     for layout in LAYOUTS:
         for count in (1, 3):

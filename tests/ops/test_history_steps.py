@@ -17,7 +17,6 @@ from mcdenoise.ops._steps import history as steps
 pytestmark = pytest.mark.usefixtures("nan_in_fresh_memory")
 SIZE = (37, 23)
 FRAMES = 9
-BMFR = {"alpha_min": 0.2, "rule": "bmfr", "position_limit": 0.01, "normal_limit": 0.3}
 
 
 class Picture(NamedTuple):
@@ -84,8 +83,8 @@ def shot(
 def passed(
     frames: list[Picture],
     backend: Any,
-    rule: dict[str, Any] | None = None,
     *,
+    alpha_min: float = 0.1,
     limit: float = 15.0,
     window: int = 7,
     specular_length: float = 2,
@@ -113,7 +112,7 @@ def passed(
                     motion = motion_from_position(past, camera)
                 history, length, kept = steps.blend(
                     *(entering, history, length, motion, Surface(past, frame.normal, depth, seen), before),
-                    **(rule or {}),
+                    alpha_min=alpha_min,
                     albedo=frame.albedo,
                     specular_length=specular_length,
                     lag_threshold=lag_threshold,
@@ -135,7 +134,8 @@ WAYS = {
     "motion": shot("previous_position"),
     "positions": shot("motion", "previous_position"),
     "previous positions": shot("motion"),
-    "without normals": shot("motion", "previous_position", "normal"),
+    # A neighbour would lie too far off.
+    "without normals": shot("motion", "previous_position", "normal", speed=0.02),
     "without albedo": shot("motion", "albedo"),
     "without depth": shot("motion", "depth"),
     "color and motion alone": shot("albedo", "normal", "depth", "position", "previous_position"),
@@ -144,19 +144,11 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("rule", [{}, BMFR, {"alpha_min": 0.4}], ids=str)
-def test_the_history_is_that_of_the_reference(way: str, rule: dict[str, Any]) -> None:
-    frames = WAYS[way]
-    if "rule" in rule and (frames[0].normal is None or frames[0].position is None):
-        with pytest.raises(ValueError, match="needs it in both frames"):
-            passed(frames, "numba", rule)
-        return
-    if way == "without normals":
-        # Else a neighbour lies too far off.
-        rule = {**rule, "position_limit": 0.2}
-    expected = passed(frames, "torch", rule)
+@pytest.mark.parametrize("alpha_min", [0.1, 0.4])
+def test_the_history_is_that_of_the_reference(way: str, alpha_min: float) -> None:
+    expected = passed(WAYS[way], "torch", alpha_min=alpha_min)
     assert expected[5].length.max() > 3
-    assert_same(passed(frames, "numba", rule), expected, 1e-9)
+    assert_same(passed(WAYS[way], "numba", alpha_min=alpha_min), expected, 1e-9)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (8, 1), (6, 300)], ids=str)

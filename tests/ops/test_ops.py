@@ -148,7 +148,6 @@ def image(*shape: int) -> Tensor:
 ONE, THREE = image(1, 1, 4, 5), image(1, 3, 4, 5)
 GRID = image(1, 3, 1, 1, 4)
 SURFACE = ops.Surface(position=THREE, normal=THREE)
-BMFR = {"rule": "bmfr", "position_limit": 1.0, "normal_limit": 1.0}
 
 Refused = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any], str]
 # Each with the argument that is named, and the value that was found.
@@ -178,13 +177,7 @@ REFUSED: list[Refused] = [
     (ops.temporal_gradient, (ONE, ONE), {"threshold": math.nan}, "threshold: .*found nan"),
     (ops.block_regression, (THREE, ONE), {"offset": (0, 32)}, "offset: .*32"),
     (ops.history_lag, (THREE, THREE, ONE), {"threshold": 0.0}, "threshold: .*found 0.0"),
-    (ops.reproject, (THREE, THREE[:, :2], SURFACE, SURFACE), {"rule": "bmfr"}, "position_limit: .*found None"),
-    (
-        ops.reproject,
-        (THREE, THREE[:, :2], SURFACE._replace(normal=None), SURFACE),
-        BMFR,
-        "surface.normal: .*found None",
-    ),
+    (ops.reproject, (THREE, THREE[:, :2], SURFACE, SURFACE), {}, "surface.depth: .*found None"),
     (ops.accumulate, (THREE, THREE, ONE, THREE[:, :2]), {"alpha_min": 0.0}, "alpha_min: .*found 0.0"),
 ]
 

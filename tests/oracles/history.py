@@ -30,7 +30,6 @@ def reproject(
     surface: Surface | None = None,
     previous_surface: Surface | None = None,
     *,
-    rule: str = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
@@ -50,7 +49,7 @@ def reproject(
             for column in (math.floor(qx), math.floor(qx) + 1)
             if 0 <= row < height and 0 <= column < width
         ]
-        kept = [tap for tap in kept if _same_surface(current, tap[3], rule, position_limit, normal_limit)]
+        kept = [tap for tap in kept if _same_surface(current, tap[3], position_limit, normal_limit)]
         alike = [tap for tap in kept if current[3] is not None and current[3] == tap[3][3]]
         if sum(bilinear for bilinear, *_ in alike) > 1e-3:
             kept = alike
@@ -104,12 +103,11 @@ def accumulate(
     previous_surface: Surface | None = None,
     *,
     alpha_min: float = 0.1,
-    rule: str = "relative",
     position_limit: float | None = None,
     normal_limit: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """``alpha = max(1 / (n + 1), alpha_min)``, ``alpha color + (1 - alpha) history``, ``n + 1``; else ``color``, 1."""
-    fetch = functools.partial(reproject, rule=rule, position_limit=position_limit, normal_limit=normal_limit)
+    fetch = functools.partial(reproject, position_limit=position_limit, normal_limit=normal_limit)
     history, weight = (tensor.tolist() for tensor in fetch(previous, motion, surface, previous_surface))
     lengths = fetch(previous_length, motion, surface, previous_surface)[0].tolist()
     source, out, length = color.tolist(), zeros(color.shape), zeros(previous_length.shape)
@@ -118,9 +116,7 @@ def accumulate(
         found = weight[b][0][y][x] > 0
         alpha = max(1 / (n + 1), alpha_min) if found else 1.0
         out[b][c][y][x] = alpha * source[b][c][y][x] + (1 - alpha) * history[b][c][y][x]
-        # The published code stores the length in a byte.
-        grown = min(round(n) + 1, 255) if rule == "bmfr" else n + 1
-        length[b][0][y][x] = grown if found else 1.0
+        length[b][0][y][x] = n + 1 if found else 1.0
     return tensor_of(out, color.shape), tensor_of(length, previous_length.shape)
 
 
@@ -136,16 +132,12 @@ def _at(surface: tuple[Image | None, ...], b: int, y: int, x: int) -> list[list[
 def _same_surface(
     here: list[list[float] | None],
     tap: list[list[float] | None],
-    rule: str,
     position_limit: float | None,
     normal_limit: float | None,
 ) -> bool:
     # Buffers that one of the two surfaces lacks are not compared.
     both = [(a, b) if a is not None and b is not None else None for a, b in zip(here, tap, strict=True)]
     positions, normals, depths, _ = both
-    if rule == "bmfr":
-        limits = ((positions, position_limit), (normals, normal_limit))
-        return all(pair is None or limit is None or _squared_distance(*pair) < limit for pair, limit in limits)
     if normals is not None and not _squared_distance(*normals) <= (0.5 if normal_limit is None else normal_limit):
         return False
     if depths is None:

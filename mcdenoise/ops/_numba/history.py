@@ -173,9 +173,6 @@ def blend(
     surface: Surface | None,
     previous_surface: Surface | None,
     alpha_min: float,
-    rule: str,
-    position_limit: float | None,
-    normal_limit: float | None,
     albedo: Tensor | None,
     specular_length: float,
     lag_threshold: float,
@@ -183,9 +180,8 @@ def blend(
     """See :func:`mcdenoise.ops._steps.history.blend`."""
     recent_alpha = max(alpha_min, RECENT_ALPHA)
     color, length, counts = blended(
-        *(entering, previous, previous_length, motion, surface, previous_surface),
-        *(alpha_min, rule, position_limit, normal_limit),
-        Shorter(recent_alpha, albedo, specular_length + 1),
+        *(entering, previous, previous_length, motion, surface, previous_surface, alpha_min),
+        shorter=Shorter(recent_alpha, albedo, specular_length + 1),
     )
     if not math.isinf(lag_threshold):
         _discard_lag(color, length, entering, lag_threshold, recent_alpha)

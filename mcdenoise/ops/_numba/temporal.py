@@ -41,8 +41,8 @@ def reproject(
     motion: Tensor | None,
     surface: Surface | None,
     previous_surface: Surface | None,
-    rule: str,
-    *limits: float | None,
+    position_limit: float | None,
+    normal_limit: float | None,
 ) -> Any:
     """See :func:`mcdenoise.ops.reproject`; without motion the reference reads every pixel once, and is as fast."""
     if motion is None:
@@ -51,7 +51,7 @@ def reproject(
     value = torch.empty(previous.shape, dtype=dtype, device="cpu")
     weight = value.new_empty((len(value), 1, *value.shape[2:]))
     if value.numel():
-        taps = _taps(dtype, motion, surface, previous_surface, rule, *limits)
+        taps = _taps(dtype, motion, surface, previous_surface, position_limit, normal_limit)
         arguments = (value.numpy(), weight.numpy(), _planes(previous, dtype), *taps)
         share_rows(previous, lambda *rows: _reproject(*arguments, *rows))
     return value.to(previous.dtype), weight.to(previous.dtype)
@@ -70,9 +70,8 @@ def blended(
     surface: Surface | None,
     previous_surface: Surface | None,
     alpha_min: float,
-    rule: str,
-    position_limit: float | None,
-    normal_limit: float | None,
+    position_limit: float | None = None,
+    normal_limit: float | None = None,
     shorter: Shorter = Shorter(),  # noqa: B008
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As ``accumulate``, with a history that is shorter in places or channels; and how many pixels of a row have one.
@@ -85,7 +84,7 @@ def blended(
     length = torch.empty(previous_length.shape, dtype=dtype, device="cpu")
     kept = torch.zeros(batch, height, dtype=torch.int64, device="cpu")
     if result.numel():
-        taps = _taps(dtype, motion, surface, previous_surface, rule, position_limit, normal_limit)
+        taps = _taps(dtype, motion, surface, previous_surface, position_limit, normal_limit)
         images = (_planes(image, dtype) for image in (previous, previous_length, color, shorter.albedo))
         # In the dtype of the sums: a number in double precision would make the sums so.
         settings = result.new_tensor([alpha_min, shorter.recent_alpha, shorter.longest, NO_ALBEDO, STILL**2]).numpy()
@@ -106,18 +105,17 @@ def _taps(
     motion: Tensor | None,
     surface: Surface | None,
     previous_surface: Surface | None,
-    rule: str,
     position_limit: float | None,
     normal_limit: float | None,
 ) -> Sequence[Any]:
-    """What :func:`_find_taps` needs: motion, surfaces, limits, and whether they are those of the rule ``"bmfr"``."""
+    """What :func:`_find_taps` needs: motion, surfaces, limits."""
     here, there = comparable(surface, previous_surface)
     if position_limit is None:
         position_limit = DEPTH_LIMIT if here.position is None else PLANE_LIMIT
     normal_limit = NORMAL_LIMIT_SQUARED if normal_limit is None else normal_limit
     limits = torch.tensor([position_limit, normal_limit, LABEL_WEIGHT], dtype=dtype, device="cpu").numpy()
     surfaces = (tuple(_planes(buffer, dtype) for buffer in buffers) for buffers in (here, there))
-    return (_planes(motion, dtype), *surfaces, limits, rule == "bmfr")
+    return (_planes(motion, dtype), *surfaces, limits)
 
 
 @compiled
@@ -129,7 +127,6 @@ def _reproject(
     here: Any,
     there: Any,
     limits: Any,
-    bmfr: bool,
     b: int,
     first: int,
     last: int,
@@ -140,7 +137,7 @@ def _reproject(
         for x0 in range(0, width, _RUN):
             x1 = min(x0 + _RUN, width)
             found = weight[b, 0, y, x0:x1]
-            _find_taps(found, weights, places, motion, here, there, limits, bmfr, height, width, b, y, x0)
+            _find_taps(found, weights, places, motion, here, there, limits, height, width, b, y, x0)
             _sum_taps(value, found, weights, places, previous, b, y, x0)
 
 
@@ -158,7 +155,6 @@ def _blend(
     here: Any,
     there: Any,
     limits: Any,
-    bmfr: bool,
     b: int,
     first: int,
     last: int,
@@ -174,11 +170,11 @@ def _blend(
             x1 = min(x0 + _RUN, width)
             start, end = y * width + x0, y * width + x1
             found, alpha, recent_alpha = total[: x1 - x0], alphas[0, : x1 - x0], alphas[1, : x1 - x0]
-            _find_taps(found, weights, places, motion, here, there, limits, bmfr, height, width, b, y, x0)
+            _find_taps(found, weights, places, motion, here, there, limits, height, width, b, y, x0)
             _sum_taps(result, found, weights, places, previous, b, y, x0)
             _sum_taps(lengths, found, weights, places, previous_length, b, y, x0)
             length = lengths[b, 0, y, x0:x1]
-            counts[b, y] += _weigh(alpha, length, found, settings, bmfr)
+            counts[b, y] += _weigh(alpha, length, found, settings)
             if albedo.shape[1] and motion.shape[1]:
                 _shorten(alpha, length, albedo, motion, settings, b, start)
             if channels > fresh:
@@ -203,7 +199,6 @@ def _find_taps(
     here: Any,
     there: Any,
     limits: Any,
-    bmfr: bool,
     height: int,
     width: int,
     b: int,
@@ -236,11 +231,8 @@ def _find_taps(
     for tap in range(4 if moves else 1):
         weight, place = weights[tap, : total.size], places[tap, : total.size]
         if normal.shape[1]:
-            _reject_apart(weight, place, normal, normal_before, limits[1], bmfr, b, start)
-        if bmfr:
-            if position.shape[1]:
-                _reject_apart(weight, place, position, position_before, limits[0], bmfr, b, start)
-        elif depth.shape[1]:
+            _reject_turned(weight, place, normal, normal_before, limits[1], b, start)
+        if depth.shape[1]:
             points = (position, position_before, normal)
             _reject_distant(weight, place, depth, depth_before, *points, limits[0], b, start)
     if label.shape[1]:
@@ -249,17 +241,15 @@ def _find_taps(
 
 
 @compiled
-def _reject_apart(
-    weight: Any, place: Any, vector: Any, before: Any, limit: Any, strict: bool, b: int, start: int
-) -> None:
-    """Reject taps whose normals or positions are too far apart: NaN is."""
+def _reject_turned(weight: Any, place: Any, normal: Any, before: Any, limit: Any, b: int, start: int) -> None:
+    """Reject taps whose normals are too far apart: NaN is."""
     zero = weight.dtype.type(0)
     for i in range(weight.size):
         squares = zero
         for c in range(3):
-            difference = before[b, c, place[i]] - vector[b, c, start + i]
+            difference = before[b, c, place[i]] - normal[b, c, start + i]
             squares += difference * difference
-        if not (squares < limit or (squares == limit and not strict)):
+        if not squares <= limit:
             weight[i] = zero
 
 
@@ -337,14 +327,14 @@ def _sum_taps(values: Any, total: Any, weights: Any, places: Any, image: Any, b:
 
 
 @compiled
-def _weigh(alpha: Any, length: Any, total: Any, settings: Any, bmfr: bool) -> int:
+def _weigh(alpha: Any, length: Any, total: Any, settings: Any) -> int:
     """Weights of the frame, and its length in place of the history's; how many pixels have a history."""
     number, count = length.dtype.type, 0
     one = number(1)
     for i in range(length.size):
         if total[i] > 0:
             alpha[i] = max(one / (length[i] + one), settings[0])
-            length[i] = min(np.rint(length[i]) + one, number(255)) if bmfr else length[i] + one
+            length[i] += one
             count += length[i] > one
         else:
             alpha[i], length[i] = one, one

@@ -20,7 +20,7 @@ from mcdenoise.ops._constants import (
 )
 from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes, root_variance
 from mcdenoise.ops._op import op, plain
-from mcdenoise.ops._surface import Rule, Surface
+from mcdenoise.ops._surface import Surface
 from mcdenoise.ops._window import corner
 from mcdenoise.ops.demodulation import demodulate
 from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
@@ -135,9 +135,6 @@ def _check_blend(
     previous_surface: Surface | None = None,
     *,
     alpha_min: float = 0.1,
-    rule: str = "relative",
-    position_limit: float | None = None,
-    normal_limit: float | None = None,
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
@@ -153,9 +150,6 @@ def _check_blend(
     check_accumulate(
         *(previous, previous, previous_length, motion, surface, previous_surface),
         alpha_min=alpha_min,
-        rule=rule,
-        position_limit=position_limit,
-        normal_limit=normal_limit,
     )
 
 
@@ -169,9 +163,6 @@ def blend(
     previous_surface: Surface | None = None,
     *,
     alpha_min: float = 0.1,
-    rule: Rule = "relative",
-    position_limit: float | None = None,
-    normal_limit: float | None = None,
     albedo: Tensor | None = None,
     specular_length: float = math.inf,
     lag_threshold: float = math.inf,
@@ -198,9 +189,6 @@ def blend(
         surface: see :func:`mcdenoise.ops.reproject`.
         previous_surface: see :func:`mcdenoise.ops.reproject`.
         alpha_min: see :func:`mcdenoise.ops.accumulate`.
-        rule: see :func:`mcdenoise.ops.reproject`.
-        position_limit: see :func:`mcdenoise.ops.reproject`.
-        normal_limit: see :func:`mcdenoise.ops.reproject`.
         albedo: ``(B, 3, H, W)``, which says where mirrors and glass are; without it no history is shortened for them.
         specular_length: in frames, at least 0.
         lag_threshold: see :func:`mcdenoise.ops.history_lag`; infinity makes no test.
@@ -218,9 +206,6 @@ def blend(
     color, length = plain(accumulate)(
         *(both, previous, previous_length, motion, surface, previous_surface),
         alpha_min=alpha_min,
-        rule=rule,
-        position_limit=position_limit,
-        normal_limit=normal_limit,
     )
     pixels = max(length.shape[-2] * length.shape[-1], 1)
     kept = (length > 1).sum((1, 2, 3)) / pixels
