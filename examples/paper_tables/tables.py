@@ -34,7 +34,7 @@ from statistics import mean, median, quantiles
 from typing import Any, get_args
 
 import torch
-from folds import FILTERS, ORDERS, OTHERS, OWN, PARTS, RIVALS, Split, fold_folder, scenes_of
+from folds import FILTERS, KEPT, ORDERS, OTHERS, OWN, PARTS, RIVALS, Split, fold_folder, scenes_of
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
@@ -195,7 +195,7 @@ def table_1(measured: Measured) -> Table:
     every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
     every |= {name: of(model) for name, model in RIVALS.items()}
     every |= {"P+K, initial": of("cascaded", "initial"), "P+K": of("cascaded")}
-    every |= {name: of(model) for name, model in {**OTHERS, **FILTERS, "OIDN": "oidn"}.items()}
+    every |= {name: of(model) for name, model in {**OTHERS, **FILTERS, **KEPT, "OIDN": "oidn"}.items()}
     averages = {name: measured.average(errors) for name, errors in every.items()}
     for name, errors in every.items():
         cells = [found.cells(each) for each in [*errors, averages[name]]]
