@@ -1,4 +1,4 @@
-"""Determining what the values of a shot's files mean, from its first frames."""
+"""Determining what the values of a shot's files mean, from a few frames."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _ORIGIN = 1e-2
 
 
 def examine(shot: RenderedFiles, color_has_albedo: bool | None) -> dict[str, Image]:
-    """Determine what the values of the first frame mean, and of the next ones if there is motion.
+    """Determine what the values of the examined frame mean, and of the next ones if there is motion.
 
     Returns:
-        The images of the first frame.
+        The images of that frame.
     """
-    number, chosen = shot.numbers[0], dict(shot.choice.layers)
+    number, chosen = shot.examined, dict(shot.choice.layers)
     images = shot.read_buffers(number, [n for n in chosen if n != "reference" or number in shot.reference_numbers])
     readings = {name: [shot.choice.reasons[name]] if name in shot.choice.reasons else [] for name in images}
     _examine_color(shot, images, readings["color"], color_has_albedo)
@@ -106,7 +106,7 @@ def _examine_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
     position, known = images["position"], shot.known(images)
     words = readings.setdefault("view_projection", [])
     if shot.cameras is not None:
-        stated = shot.cameras.view_projection(shot.numbers[0], shot.size)
+        stated = shot.cameras.view_projection(shot.examined, shot.size)
         if _examine_cameras(shot, stated, position, known, words):
             return
     if not shot.fits_cameras:
@@ -126,9 +126,9 @@ def _examine_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
                 "that file, or motion"
             )
     elif not shot.positions_of_camera and _is_origin(found, position, known) and _ends_at_origin(shot):
-        if world_to_camera(shot.metadata(shot.numbers[0])) is not None:
+        if world_to_camera(shot.metadata(shot.examined)) is not None:
             shot.positions_of_camera = True
-            images["position"] = shot.in_world(shot.numbers[0], images["position"])
+            images["position"] = shot.in_world(shot.examined, images["position"])
             readings["position"].append("in the space of the camera, brought to the world by 'worldToCamera'")
             _examine_positions(shot, images, readings)
             return
@@ -151,7 +151,7 @@ def _examine_cameras(shot: RenderedFiles, stated: Array, position: Image, known:
     if not shot.has_camera:
         seen = f"does not see the positions at their pixels (they miss by {error:.0f}) whichever way it is read"
         instead = "cameras are found from the positions instead" if shot.fits_cameras else "no history is found"
-        shot.warnings.append(f"{MATRICES}, frame {shot.numbers[0]}: {fault(stated) or seen}; {instead}")
+        shot.warnings.append(f"{MATRICES}, frame {shot.examined}: {fault(stated) or seen}; {instead}")
     elif shot.camera_convention:
         shot.warnings.append(f"{MATRICES}: read as {how}, since only so it sees the positions at their pixels")
     return shot.has_camera
@@ -177,9 +177,9 @@ def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention
     given = _MOTION.get(layer.title.lower(), USUAL_MOTION)
     kept = {"albedo", "normal"} & set(shot.choice.layers) or {"color"}
     pairs, seen_elsewhere = [], []
-    following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1][:MOTION_PAIRS]
+    following = [(a, b) for a, b in pairwise(shot.numbers) if b == a + 1 and a >= shot.examined][:MOTION_PAIRS]
     names = kept | {"motion"} | ({"position", "depth"} & set(shot.choice.layers))
-    last, images = shot.numbers[0], first
+    last, images = shot.examined, first
     for before, now in following:
         previous = images if last == before else shot.read_buffers(before, names)
         last, images = now, shot.read_buffers(now, names)
@@ -224,18 +224,18 @@ def examine_parts(
     samples: SampleLayers,
     everywhere: Collection[Layer],
 ) -> None:
-    """Use parts of the light and samples that every frame has, if the first frame's add up to its color.
+    """Use parts of the light and samples that every frame has, if the examined frame's add up to its color.
 
     Args:
         shot: the files.
-        color: ``(H, W, 3)`` of the first frame, as stored.
+        color: ``(H, W, 3)`` of the examined frame, as stored.
         splits: candidates; the first one that adds up is used.
         samples: the layers of samples.
         everywhere: those of these layers that every frame has, with the pixels of the color.
     """
     refused: list[tuple[Split, float, float]] = []
     for split in (each for each in splits if shot.color_has_albedo and each.layers <= {*everywhere}):
-        pixels = shot.read(shot.numbers[0], split.layers)
+        pixels = shot.read(shot.examined, split.layers)
         sums = split.sums(pixels)
         far = split.difference(sums, color)
         if not is_same(far):
@@ -268,7 +268,7 @@ def examine_parts(
         return
     if not samples.layers <= {*everywhere}:
         shot.warnings.append("'samples': some frames have others, or of other pixels, or none: not used")
-    elif not mean_is(color, samples.samples(shot.read(shot.numbers[0], samples.layers))):
+    elif not mean_is(color, samples.samples(shot.read(shot.examined, samples.layers))):
         shot.warnings.append(
             f"'samples': the mean of {len(samples.radiance)} is not the color: not used; write all samples of a pixel, "
             "with the weights of the pixel filter in them"

@@ -57,6 +57,7 @@ class RenderedFiles(FrameSequence):
         split: the layers of diffuse and specular light, if they add up to the color.
         samples: the layers of single samples, if their mean is the color.
         more: the kinds of files for each further noise seed.
+        examined: number of the frame that told all this.
     """
 
     groups: Sequence[FileGroup]
@@ -72,6 +73,7 @@ class RenderedFiles(FrameSequence):
     split: Split = NO_SPLIT
     samples: SampleLayers = NO_SAMPLES
     more: Sequence[Sequence[FileGroup]] = ()
+    examined: int = 0
     # Whether a camera is found from positions where none is given, and data windows must not differ.
     fits_cameras: ClassVar[bool] = True
     one_window: ClassVar[bool] = False

@@ -90,10 +90,11 @@ def open_files(
     numbers = choose_numbers(sorted(groups[color.group].files))
     parts = [_parts(header, color_space) for header in headers]
     shot = make(groups, parts, choice, numbers=numbers, warnings=choice.warnings)
+    shot.examined = _examined(shot)
     everywhere = _check_files(shot, splits, samples)
     for own in shot.more:
         everywhere &= _check_files(replace(shot, groups=own), splits, samples)
-    shot.lights, left = find_lights(where, layers, color, lights, lambda wanted: _some_pixels(shot, wanted))
+    shot.lights, left = find_lights(where, layers, color, lights, functools.partial(_some_pixels, shot, shot.examined))
     shot.cameras = find_camera_matrices(shot.file(color, numbers[0]).parent, numbers[-1])
     images = examine(shot, color_has_albedo)
     if left is not None:
@@ -246,9 +247,19 @@ def _look_beside(shot: RenderedFiles) -> None:
         )
 
 
-def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Image]:
-    """``(N, 3)`` the same pixels of layers of the first frame, of those with the data window of the color."""
-    main, number = shot.part_of(shot.choice.layers["color"]), shot.numbers[0]
+def _examined(shot: RenderedFiles) -> int:
+    """The first frame, or one that shows something where that is empty: a shot may fade in, or begin with the sky."""
+    layers = [layer for name, layer in shot.choice.layers.items() if name in ("color", "normal", "position")]
+    for number in (shot.numbers[0], shot.numbers[len(shot.numbers) // 2], shot.numbers[-1]):
+        # A single value everywhere tells nothing.
+        if all(np.ptp(np.nan_to_num(pixels)) > 0 for pixels in _some_pixels(shot, number, layers).values()):
+            return number
+    return shot.numbers[0]
+
+
+def _some_pixels(shot: RenderedFiles, number: int, layers: Sequence[Layer]) -> dict[Layer, Image]:
+    """``(N, C)`` the same pixels of layers of a frame, of those with the data window of the color."""
+    main = shot.part_of(shot.choice.layers["color"])
     height, width = main.window.size
     same = [layer for layer in dict.fromkeys(layers) if shot.part_of(layer).window == main.window]
     same = [layer for layer in same if shot.has(layer, number)]
@@ -256,7 +267,8 @@ def _some_pixels(shot: RenderedFiles, layers: Sequence[Layer]) -> dict[Layer, Im
     for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int).tolist():
         strips = read_files(lambda layer: shot.file(layer, number), same, slice(top, top + _STRIP))
         for layer, pixels in strips.items():
-            part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3].reshape(-1, 3)
+            part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3]
+            image = image.reshape(-1, image.shape[-1])
             found[layer].append(decode(image, part.gamma) if part.display_referred else image)
     return {layer: np.concatenate(strips) for layer, strips in found.items()}
 

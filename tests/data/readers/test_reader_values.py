@@ -328,3 +328,25 @@ def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, tmp_path: Pa
     assert "motion" in still.buffers
     assert list(still.warnings) == []
     assert not still.frame(2).motion.any()
+
+
+@pytest.mark.parametrize("black", [0, 1])
+def test_a_shot_that_fades_in_is_read_by_a_frame_that_shows_something(black: int, tmp_path: Path) -> None:
+    """An empty frame looks like signed normals and radiance without albedo."""
+    albedo, towards = texture("colored"), np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    towards[..., 2] = -np.abs(towards[..., 2])
+    normal = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    for number in range(4):
+        seen = float(number >= black)
+        images = {"": light(number) * albedo * seen, "albedo.": albedo * seen, "N.": (normal / 2 + 0.5) * seen}
+        names = {"": "RGB", "albedo.": "RGB", "N.": "XYZ"}
+        save(
+            tmp_path / f"shot_{number}.exr",
+            {f"{layer}{c}": image[..., i] for layer, image in images.items() for i, c in enumerate(names[layer])},
+        )
+    sequence = open_sequence(tmp_path)
+    assert {row.buffer: row.reading for row in sequence.table}["normal"] == "stored as n/2 + 1/2, decoded"
+    frame = sequence.frame(2)
+    assert frame.normal is not None
+    np.testing.assert_allclose(frame.normal[0].permute(1, 2, 0).numpy(), normal, atol=1e-3)
+    assert sequence.color_has_albedo
