@@ -96,6 +96,8 @@ def denoise(
             clamped = write_radiance(out, radiance.permute(1, 2, 0).cpu().numpy())
             if clamped:
                 warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
+            if shot.alpha:
+                warn([f"{out}: the radiance alone, without the alpha; the format of the input keeps it"])
 
 
 def _by_buffer(
