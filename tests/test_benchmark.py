@@ -28,7 +28,7 @@ from mcdenoise.benchmark.memory import peak_memory
 from mcdenoise.benchmark.operators import largest_case
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.check.cases import OPS
-from mcdenoise.data import open_sequence, read_exr
+from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_matrices import read_camera_matrices, write_camera_matrices
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
@@ -165,6 +165,18 @@ def test_errors_and_pictures_are_of_the_images(small_sequence: Path, out: Path) 
         pixels, channels, _ = read_exr(out / "images" / "plane" / folder / "3.exr")
         assert channels == ["R", "G", "B"]
         np.testing.assert_allclose(pixels, image[0].permute(1, 2, 0).numpy(), rtol=1e-3, atol=1e-6)
+
+
+def test_errors_are_those_of_evaluate_in_other_primaries(small_sequence: Path, out: Path) -> None:
+    acescg = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+    for path in (small_sequence / "inputs").glob("color*.exr"):
+        pixels, channels, _ = read_exr(path)
+        write_exr(path, pixels, channels, metadata={"chromaticities": acescg})
+    sequence = open_sequence(small_sequence)
+    results = run_benchmark([sequence], choose_methods("none"), out, Settings(rounds=1))
+    strict = evaluate_method(sequence, Denoiser("noisy"), "noisy").tables["strict"].mean
+    errors = results.cell("plane", "noisy").errors
+    assert {name: errors[name] for name in METRICS} == pytest.approx({name: strict[name] for name in METRICS}, rel=1e-5)
 
 
 def test_a_method_that_fails_on_one_scene_leaves_the_rest_alone(small_sequence: Path, out: Path) -> None:

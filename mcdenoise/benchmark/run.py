@@ -20,6 +20,7 @@ from mcdenoise.benchmark.methods import Timed, make_method
 from mcdenoise.benchmark.sizes import Size, measure_sizes
 from mcdenoise.benchmark.tables import write_csv
 from mcdenoise.data import Sequence, open_sequence, write_exr
+from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.files import make_folder, new_folder
 from mcdenoise.data.images import Metadata
 from mcdenoise.data.sequences import with_unique_names
@@ -214,9 +215,10 @@ class _SceneRun:
     def _warm_up(self, on_step: Callable[[], None]) -> None:
         """Run every method on every frame once; score its images and store some of them."""
         for number, frame, _ in self._frames(reference=True):
-            kept = number in self._scene.pictures
+            kept, metadata = number in self._scene.pictures, self._sequence.metadata(number)
             # With the primaries that the frames state, so that the report can show them.
-            primaries = {name: x for name, x in self._sequence.metadata(number).items() if name == "chromaticities"}
+            primaries = {name: x for name, x in metadata.items() if name == "chromaticities"}
+            reference = None if frame.reference is None else to_rec709(frame.reference, metadata)
             if kept and frame.reference is not None:
                 self._keep("reference", number, frame.reference, primaries)
             for method, timed in self._at_work():
@@ -224,9 +226,10 @@ class _SceneRun:
                 with self._noted(method.name):
                     image = timed(frame)
                     self._planned[method.name].append(list(timed.denoiser.report.stages.values()))
-                    if frame.reference is not None:
+                    if reference is not None:
                         with torch.inference_mode():
-                            self._scores[method.name].add(self._metrics, number, image, frame.reference)
+                            shown = to_rec709(image, metadata)
+                            self._scores[method.name].add(self._metrics, number, shown, reference)
                 if kept and image is not None and method.name not in self._failures:
                     self._keep(method.folder, number, image, primaries)
             on_step()
