@@ -6,7 +6,7 @@
 A reference of a take has 264 samples a pixel; its noise is up to two thirds of the error of a good method, which hides
 what methods differ by; without ``clean``, errors contain it. So ``clean`` gets copies with clean references first
 (:func:`mcdenoise.train.clean_references`). Errors are of the frames with references, the last three of a shot of 16.
-Open Image Denoise has its better setting of each take: features as noisy, or denoised first.
+Open Image Denoise has its best setting of each take: features as noisy, as exact, or denoised first.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from mcdenoise.train.footage import frame_of
 
 # Errors by take, method and metric.
 Rows: TypeAlias = dict[str, dict[str, dict[str, float]]]
-OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=prefiltered)")
+OIDN = ("oidn(auxiliary=noisy)", "oidn(auxiliary=clean)", "oidn(auxiliary=prefiltered)")
 # Those that the documentation compares, with their labels there.
 METHODS = {
     "oidn(quality=fast,auxiliary=noisy)": "OIDN fast",
@@ -73,12 +73,12 @@ def rows_of(rows: Rows, *, moving: bool) -> list[dict[str, dict[str, float]]]:
 
 
 def ratios(rows: Rows, name: str, key: str, *, moving: bool) -> list[float]:
-    """A method's errors of shots, or of stills, over those of Open Image Denoise's better setting of each take."""
+    """A method's errors of shots, or of stills, over those of Open Image Denoise's best setting of each take."""
     return [row[name][key] / min(row[each][key] for each in OIDN) for row in rows_of(rows, moving=moving)]
 
 
 def table(rows: Rows, models: list[str], moving: bool) -> Iterable[str]:
-    """Lines of a table: each method beside Open Image Denoise's better setting of each take."""
+    """Lines of a table: each method beside Open Image Denoise's best setting of each take."""
     kept = rows_of(rows, moving=moving)
     if not kept:
         return

@@ -38,7 +38,7 @@ class Figures(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """Geometric means, and the worst, of errors over those of Open Image Denoise's better setting of each take."""
+    """Geometric means, and the worst, of errors over those of Open Image Denoise's best setting of each take."""
 
     shots: float
     worst_shot: float
