@@ -24,8 +24,8 @@ docs: $(VENV)/.stamp-fast,oidn,docs ## build the documentation as a site that op
 figures: $(VENV)/.stamp-fast,render,peers,report ## measure anew what the documentation says of error and run time; takes an hour
 	$(BIN)/mcdenoise generate --takes --unseen --seeds 900112-900127 -o build/figures/takes
 	$(BIN)/mcdenoise generate --takes --unseen --plain --frames 32 --seeds 900132-900139 -o build/figures/long
-	for takes in takes long; do $(BIN)/python examples/takes.py build/figures/$$takes --clean build/figures/clean-$$takes \
-		--json benchmarks/$$takes.json || exit; done
+	for takes in takes long; do rm -f benchmarks/$$takes.json && $(BIN)/python examples/takes.py build/figures/$$takes \
+		--clean build/figures/clean-$$takes --json benchmarks/$$takes.json || exit; done
 	$(BIN)/python examples/run_time.py --threads 2 --rounds 5 --json benchmarks/run-time.json
 	$(BIN)/python examples/write_tables.py benchmarks
 
