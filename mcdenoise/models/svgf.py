@@ -66,7 +66,8 @@ class Svgf(nn.Module):
             filtered, variance = atrous(filtered, variance, frame.normal, frame.depth, step=1 << level)  #  Eqs. 1 and 2
             # Sec. 4.3: the first level feeds the history.
             kept = filtered if level == 0 else kept
-        output = answered(frame, filtered.to(frame.color.dtype)).noted(Note("history", reset))
+        found = None if reset else (length > 1).to(torch.float32).mean()
+        output = answered(frame, filtered.to(frame.color.dtype)).noted(Note("history", reset, value=found))
         after = Past.of(frame, torch.cat([kept, moments, length], 1))
         return output._replace(stages={"accumulated": light[:, :3].to(frame.color.dtype)}), after
 

@@ -48,6 +48,16 @@ def test_the_weight_of_a_frame_is_one_over_their_number_down_to_alpha() -> None:
 
 
 @pytest.mark.parametrize("name", ["svgf", "asvgf"])
+def test_the_report_tells_how_many_pixels_have_a_history(name: str) -> None:
+    denoiser, lost = Denoiser(name), torch.zeros(1, 2, HEIGHT, WIDTH)
+    lost[..., : WIDTH // 4] = torch.inf
+    denoiser(frame())
+    assert denoiser.report.history is None
+    denoiser(frame(seed=1, motion=lost))
+    assert denoiser.report.history == 0.75
+
+
+@pytest.mark.parametrize("name", ["svgf", "asvgf"])
 def test_a_still_camera_moves_nothing(name: str) -> None:
     """Positions, which a renderer takes anywhere in a pixel, would be projected to the pixels beside it."""
     first, second = (frame(seed=seed, position=torch.rand(1, 3, HEIGHT, WIDTH)) for seed in (0, 1))
