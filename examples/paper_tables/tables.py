@@ -141,7 +141,7 @@ class Measured:
             # Only its accumulated image is used, which is the input of all networks.
             return Denoiser(create_model("cascaded", width=4))
         if weights is None or weights.exists():
-            return Denoiser(model, weights=weights)
+            return Denoiser(model, weights=weights, precision="float32")
         raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}")
 
     def _score(self, scene: str, denoiser: Denoiser) -> dict[str, Errors]:
