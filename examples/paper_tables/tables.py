@@ -44,6 +44,7 @@ from mcdenoise.errors import InputError, run_script
 from mcdenoise.evaluate import check_references
 from mcdenoise.metrics import PROTOCOLS, smape_linear
 from mcdenoise.models import Output, create_model, describe_weights
+from mcdenoise.models._published import as_published
 from mcdenoise.models._weights import compared_models
 from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.accumulated import Accumulated
@@ -51,6 +52,7 @@ from mcdenoise.turns import interleaved
 
 PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SMAPE = "linear SMAPE"
+SAME_INPUT = "joint bilateral of the accumulated image"
 SEEDS = (1, 2, 3)
 KINDS = ("random scenes", "four times the steps", "leave one out")
 Errors = dict[str, float]  # by "protocol metric", and SMAPE of linear radiance
@@ -140,6 +142,9 @@ class Measured:
         if model == "accumulated":
             # Only its accumulated image is used, which is the input of all networks.
             return Denoiser(create_model("cascaded", width=4))
+        if model == SAME_INPUT:
+            (accumulated,) = parts_of(create_model("joint_bilateral"), Accumulated)
+            return Denoiser(as_published(accumulated.inner))
         if weights is None or weights.exists():
             return Denoiser(model, weights=weights, precision="float32")
         raise InputError(f"not trained: no {weights.relative_to(self.options.runs)}")
@@ -195,12 +200,14 @@ def table_1(measured: Measured) -> Table:
     every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
     every |= {name: of(model) for name, model in RIVALS.items()}
     every |= {"P+K, initial": of("cascaded", "initial"), "P+K": of("cascaded")}
-    every |= {name: of(model) for name, model in {**OTHERS, **FILTERS, **KEPT, "OIDN": "oidn"}.items()}
+    every |= {
+        name: of(model) for name, model in {**OTHERS, **FILTERS, SAME_INPUT: SAME_INPUT, **KEPT, "OIDN": "oidn"}.items()
+    }
     averages = {name: measured.average(errors) for name, errors in every.items()}
     for name, errors in every.items():
         cells = [found.cells(each) for each in [*errors, averages[name]]]
         found.rows += [[name, protocol, *(own[i] for own in cells)] for i, protocol in enumerate(PROTOCOL_NAMES)]
-    for name in (*RIVALS, *OTHERS, "SVGF", "OIDN"):
+    for name in (*RIVALS, *OTHERS, "SVGF", SAME_INPUT, "OIDN"):
         found.claim(f"P+K is ahead of {name}", every["P+K"], every[name])
     found.claim("the final image is ahead of the initial one", every["P+K"], every["P+K, initial"])
     return found

@@ -614,15 +614,10 @@ def test_compared_weights_have_equal_training_settings() -> None:
     about = {name: describe_weights(SHIPPED / "compared" / f"{name}.safetensors") for name in compared_models()}
     assert not set(about) & set(pretrained_models())
     own = {"model", "settings", "loss", "temporal_weight"}
-    # The page of the zoo says which one is not of the present recipe.
-    present = {name for name, each in about.items() if json.loads(each["config"])["crop"] == 128}
-    assert set(about) - present == {"anf"}
-    # Earlier code wrote the header of this one.
-    others = present - {"cascaded"}
-    configs = [json.loads(about[name]["config"]) for name in others]
+    configs = [json.loads(each["config"]) for each in about.values()]
     assert len({json.dumps({k: v for k, v in each.items() if k not in own}) for each in configs}) == 1
     for key in ("data", "initial_weights"):
-        assert len({about[name][key] for name in others}) == 1
+        assert len({each[key] for each in about.values()}) == 1
 
 
 def test_weights_in_bfloat16_load(weights: Path) -> None:
