@@ -51,7 +51,8 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
 
     Pixels are void where ``mask`` is 0; where alpha and color are 0; or, in a frame without mask, alpha, motion and
     camera, where the depth is infinite and the color 0. Alpha and depth only count if no more than a thousandth of the
-    light is where they say that nothing is.
+    light is where they say that nothing is. In a frame with motion or camera, a few pixels are no void: the only path
+    of a pixel may miss hair that covers half of it.
 
     In a frame without motion and camera, in which no pixel is partly covered, connected pixels that are not void are a
     chart. The numbers of charts are a buffer of their own, :data:`ISLAND`, for methods that compare features.
@@ -73,6 +74,10 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
     if nothing is not None:
         covers = _covers(color, nothing)
         empty = nothing & (color == 0).all(1, keepdim=True) & covers
+        # Where alpha is wanted, too, such pixels are filled, and weighed by it at the end.
+        if not chart and not frame.hints.alpha:
+            inside = F.max_pool2d((~empty).to(color.dtype), 3, 1, 1) <= 0
+            empty = empty & (F.max_pool2d(inside.to(color.dtype), 5, 1, 2) > 0)
         void = empty if void is None else void | empty
         if alpha is not None and frame.hints.alpha:
             divided = covers

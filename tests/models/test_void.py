@@ -265,3 +265,13 @@ def test_the_output_keeps_the_layers_of_void_pixels() -> None:
     output = with_void(mcdenoise.models.Output(filled.color, layers=dict(filled.layers)), frame, void)
     assert torch.equal(output.image, color)
     assert torch.equal(output.layers["all"], color)
+
+
+def test_a_pixel_that_its_path_left_empty_is_no_void() -> None:
+    """A third of the paths miss the hair on the left; on the right is nothing."""
+    alpha = (torch.rand(1, 1, 48, 64, generator=torch.Generator().manual_seed(0)) < 0.7).float()
+    alpha[..., 32:] = 0
+    _, void = without_void(Frame(alpha.expand(-1, 3, -1, -1), alpha=alpha, motion=torch.zeros(1, 2, 48, 64)))
+    assert void.mask is not None
+    assert not void.mask[..., :30].any()
+    assert void.mask[..., 32:].all()
