@@ -30,7 +30,7 @@ def generate(
     out: Out,
     rendering: tyro.conf.OmitArgPrefixes[RenderOptions] = _FOR_TRAINING,
     seeds: str = "0-15",
-    frames: int = _FRAMES,
+    frames: int | None = None,
     renderer: Literal["mitsuba", "cycles"] = "mitsuba",
     parts: Flag = False,
     threads: int = 0,
@@ -49,7 +49,7 @@ def generate(
         out: folder of the sequences; finished frames in it are kept.
         rendering: samples, references, size and processors.
         seeds: seeds of the scenes, such as 0-99,200.
-        frames: frames of each sequence; with --takes 16 by default.
+        frames: frames of each sequence; 12 by default, with --takes 16.
         renderer: mitsuba samples pixel centres, with features without noise. With cycles, by Blender, each noisy color
             has features of its own; pixel filter, depth of field and motion blur are drawn from the seed. A Python that
             has Blender's module bpy is named by the environment variable BLENDER_PYTHON, or else is this one.
@@ -60,7 +60,7 @@ def generate(
             stills, the others have 16 frames with references on the last three. Pixel filter, lens, features and
             samples are drawn, too. The only other options that count are --plain, --frames, --size, --reference-spp
             (from 2 on; rounded up to a number that can be stratified), --variant, --threads and the address of a
-            cluster.
+            cluster; a size of 160x160 and 64 samples, which sequences have by default, count as not given.
         plain: takes of one sample at pixel centres, with features without noise, as most papers of interactive
             denoising have them; no stills.
         assets: folder of the models, skies and normal maps, which are fetched to it; by default in the user's cache.
@@ -69,7 +69,7 @@ def generate(
     """
     if parts and renderer != "cycles":
         raise InputError("--parts: expected together with --renderer cycles: Mitsuba's path integrator has no parts")
-    if frames < 1:
+    if frames is not None and frames < 1:
         raise InputError(f"--frames: expected at least 1, found {frames}")
     if plain and not takes:
         raise InputError("--plain: expected together with --takes: the other sequences of Mitsuba are plain")
@@ -86,7 +86,8 @@ def generate(
         plan = TakePlan(**common, variant=str(variant), plain=plain, **_of_takes(rendering, frames))
     else:
         arguments |= {"variant": variant}
-        plan = SequencePlan(**common, frames=frames, rendering=arguments, cycles=renderer == "cycles", parts=parts)
+        common |= {"frames": frames or _FRAMES}
+        plan = SequencePlan(**common, rendering=arguments, cycles=renderer == "cycles", parts=parts)
     with progress_bar() as progress:
         scenes = progress.add_task("takes" if takes else "scenes", total=len(chosen))
 
@@ -118,7 +119,7 @@ def _opened(folder: str | None) -> Assets:
     return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
 
-def _of_takes(rendering: RenderOptions, frames: int) -> dict[str, Any]:
+def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:
     """How packed takes are rendered; options that have the defaults of sequences have those of takes."""
     given = {name: value for name, value in vars(rendering).items() if value != getattr(_FOR_TRAINING, name)}
     others = given.keys() - {"size", "reference_spp", "variant", "workers"}
@@ -127,7 +128,7 @@ def _of_takes(rendering: RenderOptions, frames: int) -> dict[str, Any]:
     if rendering.reference_spp < 2:
         raise InputError(f"--reference-spp: expected at least 2 for --takes, found {rendering.reference_spp}")
     return {
-        **({} if frames == _FRAMES else {"frames": frames}),
+        **({} if frames is None else {"frames": frames}),
         **({"size": parse_size(rendering.size)} if "size" in given else {}),
         **({"half": stratified(rendering.reference_spp // 2)} if "reference_spp" in given else {}),
     }

@@ -202,8 +202,9 @@ def test_takes_are_generated_resumed_and_trained_on(tmp_path: Path, capsys: pyte
     written = path.stat().st_mtime_ns
     assert run() == 0
     assert path.stat().st_mtime_ns == written
-    assert run("--frames", "5") == 2
-    assert "frames" in capsys.readouterr().err
+    # Also the number that sequences have by default.
+    assert run("--frames", "12") == 2
+    assert "frames 12, found 4" in capsys.readouterr().err
 
     frames = len(shard)
     config = TrainConfig(
