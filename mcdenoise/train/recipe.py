@@ -21,7 +21,7 @@ import json
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import GenericAlias
 from typing import Annotated, Any, Literal, get_type_hints
@@ -99,11 +99,26 @@ class Rendering:
             if not finished.exists():
                 generate()
                 write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
+            elif self.name:
+                self._check_finished(finished)
             sequences = find_shards(place) or sorted(path for path in place.iterdir() if path.is_dir())
             if self.clean:
                 out = place.with_name(f"{place.name}-clean")
                 sequences = [clean_references(sequence, out) for sequence in sequences]
         return sequences
+
+    def _check_finished(self, finished: Path) -> None:
+        """Refuse a folder of this name that was rendered with other options."""
+        try:
+            found = json.loads(read_text(finished))
+            same = replace(self, options=found).sha256 == self.sha256
+        except (OSError, ValueError, AttributeError, RecursionError):
+            found, same = "none that can be read", False
+        if not same:
+            raise InputError(
+                f"{self.where}: expected {finished.parent} rendered with {dict(self.options)}, found {found}; choose "
+                f"another folder, or remove {finished.name} to add to what is in it"
+            )
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,17 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from commands import refuses, run, succeeds
+from refusals import refused
 
 from mcdenoise.cli.train import options_of
 from mcdenoise.data import open_sequence
 from mcdenoise.models import describe_weights
-from mcdenoise.train import Recipe, clean_references
+from mcdenoise.train import Recipe, Rendering, clean_references
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 TINY = RECIPES / "tiny.toml"
@@ -91,6 +93,23 @@ def test_another_recipe_does_not_go_on_with_a_run(trained: Path, tmp_path: Path)
     assert status == 2
     assert "data.json: expected " in said
     assert renderings(trained / "data") == before
+
+
+def test_a_folder_with_a_name_is_of_the_options_that_it_was_rendered_with(tmp_path: Path) -> None:
+    place, rendered = tmp_path / "shots", list[str]()
+
+    def make(seeds: str, **more: Any) -> list[Path]:
+        rendering = Rendering("recipe", {"seeds": seeds, "frames": 3, **more}, clean=False, name="shots")
+        return rendering.make(tmp_path, lambda: (place / f"random{seeds}").mkdir() or rendered.append(seeds))
+
+    # The number of threads changes no pixel.
+    assert make("1") == make("1", threads=2) == [place / "random1"]
+    message = refused(lambda: make("2"))
+    assert "'seeds': '2'" in message
+    assert "'seeds': '1'" in message
+    (place / "finished.json").unlink()
+    assert make("2") == [place / "random1", place / "random2"]
+    assert rendered == ["1", "2"]
 
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
