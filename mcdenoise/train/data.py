@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
+from collections.abc import Iterator
 from collections.abc import Sequence as Sequential
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +12,20 @@ from typing import Any
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.shards import Shard, find_shards, open_shard
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, level_of_caller
+from mcdenoise.frame import MOTION, tells_motion
 from mcdenoise.models import Needs
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
-from mcdenoise.train.footage import FEATURES, Source, check_trainable, features_of, references_of, shots_of
+from mcdenoise.train.footage import (
+    FEATURES,
+    Source,
+    check_trainable,
+    features_of,
+    place_of,
+    references_of,
+    shots_of,
+)
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Shot
 
@@ -65,6 +76,8 @@ class TrainingData:
         used = (needs.buffers | needs.uses) - front.parts.keys() - {"samples"}
         for source in sources:
             check_trainable(source, needs.buffers - front.parts.keys() | (used & set(FEATURES)))
+        for doubt in _doubts(sources, used, accumulates=front.accumulates):
+            warnings.warn(doubt, stacklevel=level_of_caller())
         # The last frames of a sequence are kept for validation, unless too few would remain.
         least, held = config.frames + config.validation_frames, [0] * len(takes)
         held += [config.validation_frames if len(sequence) >= least else 0 for sequence in sequences]
@@ -97,6 +110,21 @@ class TrainingData:
         light = {"key": config.key, "exposure": config.exposure, "tint": config.tint}
         sampler = ClipSampler(shots, config.frames, config.crop, lamps=config.lamps, **light)
         return TrainingData(sampler, watched, description)
+
+
+def _doubts(sources: list[Source], used: frozenset[str], *, accumulates: bool) -> Iterator[str]:
+    """What a model is trained without although it would use it, in words."""
+    found = [features_of(source) for source in sources]
+    still = [source for source, own in zip(sources, found, strict=True) if len(source) > 1 and not tells_motion(own)]
+    if still and (accumulates or used & MOTION):
+        yield (
+            f"{place_of(still[0])}: no motion, and no positions with cameras ({len(still)} of {len(sources)} sequences "
+            "and takes): the model is trained on such frames without a history"
+        )
+    common, every = frozenset.intersection(*found), frozenset().union(*found)
+    # Motion tells what the positions are for.
+    if lost := sorted(used & every - common - (MOTION if "motion" in common else frozenset())):
+        yield f"training data: only some sequences or takes have {', '.join(lost)}; the model is trained without"
 
 
 def open_takes(paths: Sequential[Path]) -> list[Shard]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import warnings
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.shards import ERROR, Shard
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, level_of_caller
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models._motion import motion_to_previous
@@ -36,6 +37,11 @@ def features_of(source: Source) -> frozenset[str]:
     return frozenset(names) - {"color", "reference", ERROR}
 
 
+def place_of(source: Source) -> Path:
+    """The file of a take, or the folder of a sequence."""
+    return source.path if isinstance(source, Shard) else source.root
+
+
 def references_of(source: Source) -> int:
     """Number of the last frames that have a reference: all of a sequence, see :func:`check_trainable`."""
     return source.references if isinstance(source, Shard) else len(source)
@@ -51,7 +57,7 @@ def check_trainable(source: Source, wanted: frozenset[str]) -> None:
     Raises:
         InputError: a feature is missing, or a frame or a reference of a sequence.
     """
-    where = source.path if isinstance(source, Shard) else source.root
+    where = place_of(source)
     if missing := sorted(wanted - features_of(source)):
         names = ", ".join([*(name for name in FEATURES if name in wanted), *sorted(wanted - set(FEATURES))])
         raise InputError(f"{where}: expected {names} to train this model on, found no {missing[0]}")
@@ -88,7 +94,8 @@ def shots_of(
     kept, and there is one other shot.
 
     A sequence is decoded and processed at once if it is not in the cache. A take is read and processed when the first
-    clip is drawn from it, and is then kept in memory as half floats.
+    clip is drawn from it, and is then kept in memory as half floats. A warning tells of frames that repeat the noise of
+    the frame before, which a history would count again.
 
     Args:
         source: a sequence or a packed take, see :func:`check_trainable`.
@@ -126,6 +133,12 @@ def shots_of(
 
     def handed(start: int, noise_seed: int) -> dict[str, Array]:
         buffers = read(noise_seed)
+        if repeated := 0 if start else _repeated(buffers["color"]):
+            warnings.warn(
+                f"{place_of(source)}: {repeated} of {length} frames have the noise of the frame before, pixel by "
+                "pixel, which a history counts again; render each frame with its own seed",
+                stacklevel=level_of_caller(),
+            )
         kept = {name: array[max(start, first) - length :] for name, array in buffers.items() if name in wanted}
         if not front.wrappers:
             return kept
@@ -164,6 +177,11 @@ def _processed(arrays: Mapping[str, Array], front: Front, start: int, first: int
             if (image := seen.buffer(name)) is not None:
                 images.append(image.numpy())
     return {name: np.concatenate(images) for name, images in made.items() if images}
+
+
+def _repeated(color: Array) -> int:
+    """How many frames are lit, and equal to the frame before in every eighth row."""
+    return sum(bool(now.any() and np.array_equal(now, before)) for before, now in pairwise(color[:, :, ::8]))
 
 
 def _packed(shard: Shard, names: frozenset[str] | None, noise_seed: int) -> dict[str, Array]:

@@ -154,10 +154,14 @@ def test_files_of_a_finished_run(shared_sequence: Path, finished: Path) -> None:
         assert torch.equal(tensor, saved[key].half().float())
 
 
-def take(path: Path, frames: int, references: int) -> Path:
-    arrays = {name: np.full((frames, 3, 16, 16), 0.5) for name in ("color", "albedo", "normal")}
+def take(path: Path, frames: int, references: int, without: str = "", repeated: bool = False) -> Path:
+    arrays = {name: np.full((frames, 3, 16, 16), 0.5) for name in ("albedo", "normal")}
+    color = np.random.default_rng(0).random((frames, 3, 16, 16))
+    arrays |= {"color": color[:1].repeat(frames, 0) if repeated else color}
+    arrays |= {"motion": np.zeros((frames, 2, 16, 16)), "roughness": np.ones((frames, 1, 16, 16))}
     arrays |= {name: np.full((references, 3, 16, 16), 0.5) for name in ("reference", "reference_error")}
     arrays |= {"depth": np.ones((frames, 1, 16, 16))}
+    arrays.pop(without, None)
     write_shard(path, {"credits": ["chair (Ann, CC-BY 3.0)"]}, arrays)
     return path
 
@@ -183,6 +187,26 @@ def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
     message = refused(lambda: train(TrainConfig(**SMALL), takes, tmp_path / "run"))
     assert message.startswith("temporal_weight: ")
     train(TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0}), takes, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("model", "missing", "expected"),
+    [
+        ("cascaded", "motion", r"1.take.npz: no motion, .* \(1 of 2 .*without a history"),
+        ("nppd", "motion", "(1.take.npz: no motion|only some .* have motion)"),
+        ("rae", "roughness", "only some sequences or takes have roughness"),
+    ],
+)
+def test_what_a_model_is_trained_without_is_said(tmp_path: Path, model: str, missing: str, expected: str) -> None:
+    takes = [take(tmp_path / "0.take.npz", 3, 2), take(tmp_path / "1.take.npz", 3, 2, missing)]
+    config = TrainConfig(**{**SMALL, "model": model, "steps": 1})
+    with pytest.warns(UserWarning, match=expected):
+        train(config, takes, tmp_path / "run")
+
+
+def test_frames_that_repeat_the_noise_are_told(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="0.take.npz: 2 of 3 frames have the noise of the frame before"):
+        train(TrainConfig(**{**SMALL, "steps": 1}), [take(tmp_path / "0.take.npz", 3, 2, "", True)], tmp_path / "run")
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
