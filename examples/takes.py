@@ -19,13 +19,13 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
+from mcdenoise import Denoiser
 from mcdenoise.data.files import write_json
 from mcdenoise.data.shards import find_shards, open_shard
 from mcdenoise.errors import run_script
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
 from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
-from mcdenoise.models import Model
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
 from mcdenoise.train.footage import frame_of
@@ -45,13 +45,10 @@ METHODS = {
 }
 
 
-@torch.no_grad()
-def errors(model: Model, frames: Sequence[Frame], reference: Tensor) -> dict[str, float]:
+def errors(denoiser: Denoiser, frames: Sequence[Frame], reference: Tensor) -> dict[str, float]:
     """Errors of a method on the last frames, which have references."""
-    state, images = None, []
-    for frame in frames:
-        output, state = model(frame, state)
-        images.append(output.image)
+    denoiser.reset()
+    images = [denoiser(frame) for frame in frames]
     scale = oidn_exposure(reference[-1:])
     image, reference = torch.cat(images[-len(reference) :]).clamp_min(0) * scale, reference * scale
     found = {"smape": smape_linear(image, reference).mean(), "psnr": psnr_srgb(image, reference).mean()}
@@ -105,7 +102,7 @@ def main() -> None:
 
     torch.set_num_threads(options.threads)
     models = list(dict.fromkeys([*OIDN, *options.models]))
-    denoisers = {name: parse_method(name).denoiser(precision="float32").model for name in models}
+    denoisers = {name: parse_method(name).denoiser(precision="float32") for name in models}
     rows = json.loads(options.json.read_text()) if options.json and options.json.exists() else {}
     for path in (path for folder in options.takes for path in find_shards(folder)):
         shard = open_shard(clean_references(path, options.clean) if options.clean else path)

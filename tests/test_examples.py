@@ -329,6 +329,20 @@ def test_methods_are_compared_on_takes_with_clean_references(tmp_path: Path) -> 
     assert f"| noisy | {row['noisy']['smape'] / best:.3f} | {row['noisy']['smape'] / best:.3f} |" in printed
 
 
+def test_methods_are_compared_on_takes_as_they_are_used(tmp_path: Path) -> None:
+    """What a method makes of void pixels is no error: a denoiser leaves them as they are."""
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    (tmp_path / "lighter.py").write_text("def make():\n    return lambda color: color + 0.5\n")
+    light = np.full((1, 3, 48, 64), 0.5, np.float32)
+    light[..., :32] = 0
+    write_shard(tmp_path / "0.take.npz", {}, {"color": light, "alpha": 2 * light[:, :1], "reference": light})
+    method = f"{tmp_path / 'lighter.py'}:make"
+    run("takes.py", tmp_path, "--models", method, "--json", tmp_path / "errors.json")
+    row = json.loads((tmp_path / "errors.json").read_text())["0"]
+    # A third in half of the pixels, but for the constant in the denominator.
+    assert row[method]["smape"] == pytest.approx(1 / 6, abs=0.01)
+
+
 @pytest.fixture
 def packed(tmp_path: Path) -> Path:
     """A folder of parts with a shot and a larger still, whose light is less noisy with a longer history."""
