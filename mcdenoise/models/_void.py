@@ -75,7 +75,7 @@ def without_void(frame: Frame) -> tuple[Frame, Void]:
         covers = _covers(color, nothing)
         empty = nothing & (color == 0).all(1, keepdim=True) & covers
         # Where alpha is wanted, too, such pixels are filled, and weighed by it at the end.
-        if not chart and not frame.hints.alpha:
+        if not chart and not frame.hints.alpha and not (known and not empty.any()):
             inside = F.max_pool2d((~empty).to(color.dtype), 3, 1, 1) <= 0
             empty = empty & (F.max_pool2d(inside.to(color.dtype), 5, 1, 2) > 0)
         void = empty if void is None else void | empty

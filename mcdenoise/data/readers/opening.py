@@ -250,11 +250,13 @@ def _look_beside(shot: RenderedFiles) -> None:
 def _examined(shot: RenderedFiles) -> int:
     """The first frame, or one that shows something where that is empty: a shot may fade in, or begin with the sky."""
     layers = [layer for name, layer in shot.choice.layers.items() if name in ("color", "normal", "position")]
-    for number in (shot.numbers[0], shot.numbers[len(shot.numbers) // 2], shot.numbers[-1]):
+    # There is no choice in a still, and none after the others: nothing is read of the last one.
+    *others, last = dict.fromkeys([shot.numbers[0], shot.numbers[len(shot.numbers) // 2], shot.numbers[-1]])
+    for number in others:
         # A single value everywhere tells nothing.
         if all(np.ptp(np.nan_to_num(pixels)) > 0 for pixels in _some_pixels(shot, number, layers).values()):
             return number
-    return shot.numbers[0]
+    return last
 
 
 def _some_pixels(shot: RenderedFiles, number: int, layers: Sequence[Layer]) -> dict[Layer, Image]:
