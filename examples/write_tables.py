@@ -25,7 +25,9 @@ from mcdenoise.reading import read_text
 
 PAGES = ("README.md", "docs/results.md", "docs/performance.md")
 PLOT = Path("docs/error_and_time.svg")
-_TICKS, _MIDDLE = (100, 300, 1000, 3000, 10000), 1000
+_TICKS = (100, 300, 1000, 3000, 10000)
+# Milliseconds beyond which a name has no room on the right of its point.
+_NO_ROOM = 3000
 _BETWEEN = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 
 
@@ -144,7 +146,7 @@ def plot(figures: Figures, path: Path) -> None:
                 error = getattr(errors_of(figures.takes, name), kind)
                 color = "#0072b2" if name.startswith("wild") else "#d55e00"
                 axes.plot(time, error, "o" if name.startswith("wild") else "s", color=color)
-                side = "right" if time > _MIDDLE else "left"
+                side = "right" if time > _NO_ROOM else "left"
                 place = (-6 if side == "right" else 6, 4)
                 text = label.strip("`").partition(",")[0]
                 axes.annotate(text, (time, error), place, textcoords="offset points", ha=side, fontsize=8)
