@@ -134,6 +134,10 @@ def _exponent(
     dtype = accumulator_dtype(start.dtype)
     # Infinite logits are finite here, so that the weight of each of two of them is not NaN, but half.
     largest = torch.finfo(dtype).max
+    # One plane after the other, whatever the layout of the kernel: every tap is read on its own.
+    logits = start.to(dtype).contiguous().clamp(-largest, largest)
+    if not guides and distance_falloff is None:
+        return logits
     centres = [guide.to(dtype) for guide in guides]
     # Once, so that their gradients are summed in that dtype, too.
     scales = [falloff.to(dtype) for falloff in falloffs]
@@ -150,6 +154,4 @@ def _exponent(
             if spacing is not None:
                 distance = distance + (dy * dy + dx * dx) * spacing
         distances.append(distance)
-    # One plane after the other, whatever the layout of the kernel: every tap is read on its own.
-    logits = start.to(dtype).contiguous().clamp(-largest, largest)
     return logits - torch.cat(distances, 1)
