@@ -616,8 +616,10 @@ def test_compared_weights_have_equal_training_settings() -> None:
     own = {"model", "settings", "loss", "temporal_weight"}
     configs = [json.loads(each["config"]) for each in about.values()]
     assert len({json.dumps({k: v for k, v in each.items() if k not in own}) for each in configs}) == 1
-    for key in ("data", "initial_weights"):
-        assert len({each[key] for each in about.values()}) == 1
+    assert {each["initial_weights"] for each in about.values()} == {"none"}
+    # Not their checksums: another processor renders the same takes with other roundings.
+    data = [[(part["takes"], part["credits"]) for part in json.loads(each["data"])] for each in about.values()]
+    assert all(part == data[0] for part in data)
 
 
 def test_weights_in_bfloat16_load(weights: Path) -> None:
