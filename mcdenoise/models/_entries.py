@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -85,24 +85,3 @@ def register_model(
         return constructor
 
     return enter
-
-
-def register_family(
-    constructor: Callable[..., Any],
-    description: str,
-    presets: Mapping[str, tuple[str, dict[str, Any]]],
-    *,
-    kind: Kind,
-    paper: str,
-) -> None:
-    """Register a constructor under several names.
-
-    Args:
-        constructor: of all of them.
-        description: what they have in common.
-        presets: for each name what it is beside that, and its settings.
-        kind: see :func:`register_model`.
-        paper: see :func:`register_model`.
-    """
-    for name, (about, settings) in presets.items():
-        register_model(name, f"{description}: {about}", kind=kind, paper=paper, **settings)(constructor)

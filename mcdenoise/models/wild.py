@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_family
+from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
 from mcdenoise.models.accumulated import Accumulated
@@ -217,14 +217,15 @@ def _wild(
     return Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
 
 
-register_family(
-    _wild,
-    "one network for sequences and stills, that sees the accumulated radiance",
-    {
-        "wild": ("with 125 thousand multiplications a pixel", {}),
-        "wild_small": ("with 62 thousand", {"size": "small"}),
-        "wild_large": ("with 312 thousand", {"size": "large"}),
-    },
-    kind="recurrent",
-    paper="after Intel Open Image Denoise 2.5",
-)
+for _name, _size, _cost in (
+    ("wild", "base", "125 thousand multiplications a pixel"),
+    ("wild_small", "small", "62 thousand"),
+    ("wild_large", "large", "312 thousand"),
+):
+    register_model(
+        _name,
+        f"one network for sequences and stills, that sees the accumulated radiance: with {_cost}",
+        kind="recurrent",
+        paper="after Intel Open Image Denoise 2.5",
+        size=_size,
+    )(_wild)
