@@ -23,9 +23,11 @@ from mcdenoise.ops import remodulate
 
 # Darker radiance is raised to this value before the power function, whose derivative at zero is infinite.
 _DARKEST = 1e-6
+# The published smallest weight of the current frame in the accumulation.
+ALPHA = 0.2
 
 
-def as_published(method: Model, alpha_min: float = 0.2) -> Model:
+def as_published(method: Model, alpha_min: float = ALPHA) -> Model:
     """Wrap a method with demodulation and the published accumulation (Koskela et al. 2019), and nothing else.
 
     The weights are the published ones. The consistency test is that of :func:`mcdenoise.ops.reproject`, whose limits
@@ -54,15 +56,14 @@ def published(network: Callable[..., Model]) -> Callable[..., Model]:
 
     A model's settings are then those of the network, which determine its weights, and by keyword ``alpha_min``.
     """
-    alpha = inspect.signature(as_published).parameters["alpha_min"]
 
     @functools.wraps(network, updated=())
-    def made(*sizes: Any, alpha_min: float = alpha.default, **named: Any) -> Model:
+    def made(*sizes: Any, alpha_min: float = ALPHA, **named: Any) -> Model:
         inner = network(*sizes, **named)
         return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), alpha_min)
 
-    own = inspect.signature(network)
-    every = [*own.parameters.values(), alpha.replace(kind=alpha.KEYWORD_ONLY)]
+    own, added = inspect.signature(network), inspect.Parameter("alpha_min", inspect.Parameter.KEYWORD_ONLY)
+    every = [*own.parameters.values(), added.replace(default=ALPHA)]
     made.__signature__ = own.replace(parameters=every)  # type: ignore[attr-defined]
     return made
 

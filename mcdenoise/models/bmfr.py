@@ -42,7 +42,7 @@ from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import as_published
+from mcdenoise.models._published import ALPHA, as_published
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import block_regression
@@ -146,7 +146,7 @@ def _gathered(image: Tensor, places: Tensor, axis: int) -> Tensor:
 @register_model("bmfr", kind="filter", paper="Koskela et al. 2019")
 def bmfr(
     *,
-    alpha_min: float = 0.2,
+    alpha_min: float = ALPHA,
     second_alpha: float = 0.1,
     taa: bool = True,
     taa_alpha: float = 0.2,
