@@ -211,23 +211,13 @@ def regions(needed: Tensor, halo: int) -> list[Region]:
 
 def _boxes(tiles: Tensor, gap: int) -> list[Region]:
     """Boxes around groups of tiles; groups whose halos touch are one."""
-    boxes = [Region(y, x, y + 1, x + 1) for y, x in tiles.nonzero().tolist()]
-    merged = True
-    while merged:
-        merged, left = False, boxes
-        boxes = []
-        for box in left:
-            near = next((i for i, other in enumerate(boxes) if _near(box, other, gap)), None)
-            if near is None:
-                boxes.append(box)
-                continue
-            other, merged = boxes[near], True
-            boxes[near] = Region(
-                min(box.top, other.top),
-                min(box.left, other.left),
-                max(box.bottom, other.bottom),
-                max(box.right, other.right),
-            )
+    boxes: list[Region] = []
+    for row, column in tiles.nonzero().tolist():
+        box = Region(row, column, row + 1, column + 1)
+        while near := next((other for other in boxes if _near(box, other, gap)), None):
+            boxes.remove(near)
+            box = Region(*map(min, box[:2], near[:2]), *map(max, box[2:], near[2:]))
+        boxes.append(box)
     return boxes
 
 
