@@ -97,22 +97,12 @@ class WskpNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        return answered(frame, filtered(with_carried(frame), *self.maps(frame), SIDES)), None
-
-
-def filtered(image: Tensor, importance: Tensor, blend: Tensor, sides: Sequence[int]) -> Tensor:
-    """Blend the filters given by importance maps, ``sum_i blend_i box_i(exp(m_i) c) / box_i(exp(m_i))``.
-
-    Args:
-        image: ``(B, C, H, W)``.
-        importance: ``(B, N, H, W)`` logarithms, one map per filter.
-        blend: ``(B, N, H, W)`` with sum 1.
-        sides: N window sides.
-    """
-    out = torch.zeros_like(image)
-    for side, m, weight in zip(sides, importance.split(1, 1), blend.to(image.dtype).split(1, 1), strict=True):
-        out = torch.addcmul(out, weight, importance_filter(image, m, kernel_size=side))
-    return out
+        image = with_carried(frame)
+        out = torch.zeros_like(image)
+        importance, blend = self.maps(frame)
+        for side, m, weight in zip(SIDES, importance.split(1, 1), blend.to(image.dtype).split(1, 1), strict=True):
+            out = torch.addcmul(out, weight, importance_filter(image, m, kernel_size=side))
+        return answered(frame, out), None
 
 
 wskp = register_model(
