@@ -6,13 +6,12 @@ noise in alpha as in color. The light of the surface does not tell where the sur
 
 from __future__ import annotations
 
-from itertools import product
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops import cross_bilateral_filter
+from mcdenoise.ops._window import taps
 
 # Directions in which an edge may run: its alpha is a straight line in one of them.
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
@@ -60,15 +59,13 @@ def without_noise(alpha: Tensor, noise: Tensor) -> Tensor:
     Source: Buades et al. 2005, "A non-local algorithm for image denoising".
     """
     mean = _mean(alpha)
-    padded = F.pad(alpha, (1, 1, 1, 1), mode="replicate")
-    height, width = alpha.shape[-2:]
-    patch = [padded[..., y : y + height, x : x + width] / 3 for y, x in product(range(3), repeat=2)]
+    patch = [tap / 3 for tap in taps(alpha, 3, "replicate")]
     variance = noise * mean * (1 - mean)
     # Noise alone makes patches differ by twice its variance, but no patch from itself.
     others = _SIDE**2 // 2
     logits = F.pad(alpha.new_full((1, 1, 1, 1), -1 / _FALLOFF**2), (0, 0, 0, 0, others, others))
     falloff = 1 / (2 * _FALLOFF**2 * variance + 1e-8)
-    kernel = logits.expand(len(alpha), -1, height, width)
+    kernel = logits.expand(len(alpha), -1, *alpha.shape[-2:])
     smooth = cross_bilateral_filter(alpha, kernel, [torch.cat(patch, 1)], [falloff], border="renormalize")
     return torch.where((mean <= 0) | (mean >= 1) | (noise <= 0), alpha, smooth.clamp(0, 1))
 
