@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -19,16 +19,6 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.oidn import Oidn
 
 
-@dataclass
-class _Span:
-    """Start and end of one run of a stage, with those inside it."""
-
-    stage: str
-    start: Moment
-    end: Moment = None
-    within: list[_Span] = field(default_factory=list)
-
-
 class Times:
     """Run times of the stages of one frame, each without the stages inside it.
 
@@ -40,18 +30,20 @@ class Times:
 
     def __init__(self, device: torch.device) -> None:
         self._watch, self._thread = Stopwatch(device), threading.get_ident()
-        self._open: list[_Span] = []
-        self._spans: list[_Span] = []
+        self._open: list[str] = []
+        # The innermost stage from each moment on, none between blocks; and all stages in the order of the report.
+        self._changes: list[tuple[str, Moment]] = []
+        self._stages: list[str] = []
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Measure what runs inside this block."""
-        span = self._begin(stage)
+        self._begin(stage)
         try:
             yield
         finally:
             self._end()
-            self._spans.append(span)
+            self._stages.append(stage)
 
     @contextmanager
     def of_modules(self, modules: Iterable[tuple[nn.Module, str]]) -> Iterator[None]:
@@ -62,7 +54,8 @@ class Times:
             def begin(*_: object, stage: str = stage) -> None:
                 # Another thread may run the same module for a denoiser of its own.
                 if threading.get_ident() == self._thread:
-                    self._spans.append(self._begin(stage))
+                    self._stages.append(stage)
+                    self._begin(stage)
 
             def end(*_: object) -> None:
                 if threading.get_ident() == self._thread:
@@ -80,23 +73,21 @@ class Times:
 
     def milliseconds(self) -> dict[str, float]:
         """The times by stage, in the order of their beginning; a block's is at its end. Waits for a GPU."""
-        found: dict[str, float] = {}
-        for span in self._spans:
-            inside = sum(self._watch.between(each.start, each.end) for each in span.within)
-            found[span.stage] = found.get(span.stage, 0.0) + self._watch.between(span.start, span.end) - inside
+        found = dict.fromkeys(self._stages, 0.0)
+        for (stage, start), (_, end) in pairwise(self._changes):
+            if stage in found:
+                found[stage] += self._watch.between(start, end)
         return found
 
-    def _begin(self, stage: str) -> _Span:
-        span = _Span(stage, self._watch.mark())
-        if self._open:
-            self._open[-1].within.append(span)
-        self._open.append(span)
-        return span
+    def _begin(self, stage: str) -> None:
+        self._open.append(stage)
+        self._changes.append((stage, self._watch.mark()))
 
     def _end(self) -> None:
         # If another hook fails before the stage begins, this is called all the same.
         if self._open:
-            self._open.pop().end = self._watch.mark()
+            self._open.pop()
+            self._changes.append((self._open[-1] if self._open else "", self._watch.mark()))
 
 
 def stages_of(model: Model, name: str) -> Iterator[tuple[nn.Module, str]]:
