@@ -7,28 +7,27 @@ high-quality global illumination".
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import Network
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.models.joint_bilateral import guide_of, guide_statistics
+from mcdenoise.models.joint_bilateral import guide_of
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.unet import Live
 
-DEPTH_SCALE = 10.0
 # Numbers for each pixel of a tile, measured: its covariance matrix of seven guides, and the solver.
 _LIVE = Live(0, 6 * 7**2)
 
 
-class Guided(nn.Module):
+class Guided(Network):
     """``kornia.filters.guided_blur`` with the albedo, normal and depth of the frame, as far as it has them, as guides.
 
     In each window the light is a linear function of the guides (He et al. 2010, Eqs. 4 to 6), and each pixel takes the
@@ -55,16 +54,12 @@ class Guided(nn.Module):
         # A pixel sees all windows that it lies in.
         self.needs = Needs(uses=GUIDES, trainable=False, reach=2 * radius + 1, live=_LIVE)
 
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """See :func:`mcdenoise.models.joint_bilateral.guide_statistics`."""
-        return guide_statistics(frame)
-
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         # All of kornia comes with it, which takes as long to import as a single frame to denoise.
         from kornia.filters import guided_blur
 
-        guide, size = guide_of(frame, DEPTH_SCALE), 2 * self.radius + 1
+        guide, size = guide_of(frame), 2 * self.radius + 1
         # The linear functions of all images in one: their coefficients are of the same guides.
         images = with_carried(frame)
         try:

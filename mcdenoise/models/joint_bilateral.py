@@ -6,22 +6,22 @@ Petschnigg et al. 2004, "Digital photography with flash and no-flash image pairs
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import Network
 from mcdenoise.models._void import ISLAND
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.tiled import TILE, Tiled
-from mcdenoise.nn.inputs import auto_exposure, normalized_depth, scale_of_depth
+from mcdenoise.nn.inputs import image_statistics, normalized_depth
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._numbers import numbers_like
 
@@ -35,7 +35,7 @@ _UNFOLDED_VALUES = 250_000_000
 _CHANNELS = 11  # of image and guide
 
 
-class JointBilateral(nn.Module):
+class JointBilateral(Network):
     """``kornia.filters.joint_bilateral_blur``, guided by albedo, normal and depth, as far as the frame has them.
 
     A frame without any guides itself by its logarithm, of which a median of 3x3 pixels is taken: a guide with noise
@@ -67,10 +67,6 @@ class JointBilateral(nn.Module):
         pixels = math.isqrt(_UNFOLDED_VALUES // (_CHANNELS * (2 * self.radius + 1) ** 2))
         return max((pixels - 2 * self.radius) // TILE, 2) * TILE
 
-    def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
-        """See :func:`guide_statistics`."""
-        return guide_statistics(frame)
-
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         # All of kornia comes with it, which takes as long to import as a single frame to denoise.
@@ -80,7 +76,7 @@ class JointBilateral(nn.Module):
         sigma_space = numbers_like(images, (self.sigma_space, self.sigma_space))[None]
         blurred: Tensor = joint_bilateral_blur(
             images,
-            guide_of(frame, DEPTH_SCALE),
+            guide_of(frame),
             size,
             self.sigma_color,
             sigma_space,
@@ -90,17 +86,17 @@ class JointBilateral(nn.Module):
         return answered(frame, blurred), None
 
 
-def guide_of(frame: Frame, depth_weight: float) -> Tensor:
-    """Albedo, normal and depth in ``[0, depth_weight]``, of those that a frame has; of none, its color's logarithm.
+def guide_of(frame: Frame) -> Tensor:
+    """Albedo, normal and depth in [0, 10], of those that a frame has; of none, its color's logarithm.
 
     That is the median of ``log1p(e x)`` in 3x3 pixels, with the exposure ``e`` of the image, so that no unit and no
     lamp matters. The number of a pixel's chart, where the frame has charts, is one more guide.
     """
     guides = [image for image in (frame.albedo, frame.normal) if image is not None]
-    statistics = {**frame.statistics, **guide_statistics(frame)}
+    statistics = image_statistics(frame)
     if frame.depth is not None:
         near, typical = statistics["depth_scale"].split(1, 1)
-        guides.append(depth_weight * normalized_depth(frame.depth, near, typical))
+        guides.append(DEPTH_SCALE * normalized_depth(frame.depth, near, typical))
     if not guides:
         guides.append(_median(torch.log1p(frame.color * statistics["exposure"])))
     guides += [ISLAND_SCALE * image for name, image in frame.extra.items() if name == ISLAND]
@@ -113,13 +109,6 @@ def _median(image: Tensor) -> Tensor:
     # kornia's own border is zero.
     padded: Tensor = median_blur(F.pad(image, (1, 1, 1, 1), mode="replicate"), 3)
     return padded[..., 1:-1, 1:-1]
-
-
-def guide_statistics(frame: Frame) -> dict[str, Tensor]:
-    """The values of the whole image that :func:`guide_of` needs: the scale of depths, or the exposure."""
-    if frame.albedo is None and frame.normal is None and frame.depth is None and "exposure" not in frame.statistics:
-        return {"exposure": auto_exposure(frame.color)}
-    return scale_of_depth(frame)
 
 
 @register_model("joint_bilateral", kind="filter", paper="Petschnigg et al. 2004")

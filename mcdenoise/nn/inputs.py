@@ -90,30 +90,19 @@ def features_of(frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
     return albedo, normal, torch.ones_like(color[:, :1]) if frame.depth is None else frame.depth
 
 
-def scale_of_depth(frame: Frame) -> dict[str, Tensor]:
-    """``depth_scale`` of a whole image ``(B, 2, 1, 1)``, see :func:`depth_scale`.
-
-    Returns:
-        An empty dictionary if the frame has the value already, or has no depth.
-    """
-    if frame.depth is None or "depth_scale" in frame.statistics:
-        return {}
-    return {"depth_scale": torch.cat(depth_scale(frame.depth), 1)}
-
-
 def image_statistics(frame: Frame) -> dict[str, Tensor]:
     """Exposure and depth scale of a whole image, unless the frame has them already.
 
     Returns:
-        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale``, see :func:`scale_of_depth`, for a
-        depth of 1 if there is none. A second network uses the values of the first one.
+        ``exposure`` ``(B, 1, 1, 1)``, see :func:`auto_exposure`; ``depth_scale`` ``(B, 2, 1, 1)``, see
+        :func:`depth_scale`, for a depth of 1 if there is none. A second network uses the values of the first one.
     """
     found = {name: frame.statistics[name] for name in ("exposure", "depth_scale") if name in frame.statistics}
     if "exposure" not in found:
         found["exposure"] = auto_exposure(frame.color)
-    found |= scale_of_depth(frame)
     if "depth_scale" not in found:
-        found["depth_scale"] = torch.cat(depth_scale(frame.color.new_ones(frame.color.shape[0], 1, 1, 1)), 1)
+        depth = frame.color.new_ones(frame.color.shape[0], 1, 1, 1) if frame.depth is None else frame.depth
+        found["depth_scale"] = torch.cat(depth_scale(depth), 1)
     return found
 
 
