@@ -80,13 +80,9 @@ class _Blended(NamedTuple):
     """A frame with its history.
 
     Args:
-        color: as in :class:`History`.
-        length: likewise.
-        carried: likewise.
+        history: with this frame, without the light that lasts; its limit is 0 where that is chosen anew.
         entering: see :func:`mcdenoise.ops._steps.history.incoming`.
         limit: limit of the fireflies of this frame.
-        next_limit: likewise, of the next one; 0 where that is chosen anew.
-        seen: where a light is seen, see :func:`mcdenoise.ops._steps.history.lights`.
         motion: to the frame before; ``None`` if nothing moves.
         still: whether that is so.
         reset: why there is no history; empty if there is one.
@@ -94,13 +90,9 @@ class _Blended(NamedTuple):
         cut: ``(B, 1, 1, 1)`` whether there is a cut; ``None`` if it is known that all images have one, or none has.
     """
 
-    color: Tensor
-    length: Tensor
-    carried: _Carried
+    history: History
     entering: Tensor
     limit: Tensor
-    next_limit: Tensor
-    seen: Tensor | None
     motion: Tensor | None
     still: bool | Tensor
     reset: str
@@ -113,15 +105,6 @@ class _Blended(NamedTuple):
         if self.cut is None:
             return Note("history", self.reset, value=self.found)
         return Note("history", "cut", self.cut.all().float(), self.found, otherwise="")
-
-    def history(self, frame: Frame, light: Tensor | None) -> History:
-        """The history for the next frame."""
-        label = self.seen
-        # In most frames no light is seen, and all labels are 0.
-        if label is not None and not (at_hand(label.device) and not label.any()):
-            label = label * _steady(self.color)
-        surface = Surface(frame.position, frame.normal, frame.depth, label)
-        return History(self.color, self.length, surface, frame.view_projection, self.next_limit, self.carried, light)
 
 
 class Accumulated(Wrapper):
@@ -225,14 +208,15 @@ class Accumulated(Wrapper):
         light, passing = self._lasting(frame, None if found.reset not in ("", NO_MOTION) else history, found)
         still = found.still is True
         notes = [*self._notes(frame, still=still, keeps=keeps), found.note]
-        after = found.history(frame, light) if keeps else None
+        color, carried = found.history.color, found.history.carried
+        after = found.history._replace(light=light) if keeps else None
         # Statistics of the noisy image are not passed on.
-        made = {"color": found.color[:, COLOR], "current": found.entering[:, COLOR], "length": found.length}
-        if found.color.shape[1] > COLOR.stop:
-            made["recent"] = found.color[:, RECENT.start : RECENT_MEAN.start]
+        made = {"color": color[:, COLOR], "current": found.entering[:, COLOR], "length": found.history.length}
+        if color.shape[1] > COLOR.stop:
+            made["recent"] = color[:, RECENT.start : RECENT_MEAN.start]
         given = frame.replace(**made, statistics={}, hints=frame.hints._replace(still=still))
-        given = self._with_carried(given, found.carried)
-        del frame, found, made
+        given = self._with_carried(given, carried)
+        del frame, found, made, color, carried
         output, inner = self.inner(given, inner)
         output = completed(given, output)
         stages = {"accumulated": given.color, **output.stages}
@@ -271,21 +255,22 @@ class Accumulated(Wrapper):
             if cut.all():
                 return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
-        made = _Blended(color, length, carried, entering, limit, limit, seen, motion, still, "", found)
         if not blind and not cut.any():
-            return made
+            after = _history(frame, color, length, limit, carried, seen)
+            return _Blended(after, entering, limit, motion, still, "", found)
         carried = tuple(
             None if part is None or old is None else torch.where(cut, part, old)
             for part, old in zip(self._first(frame, entering), carried, strict=True)
         )
         color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
-        next_limit = torch.where(cut, 0, limit) if blind else limit
-        return made._replace(color=color, length=length, carried=carried, next_limit=next_limit, cut=cut)
+        after = _history(frame, color, length, torch.where(cut, 0, limit) if blind else limit, carried, seen)
+        return _Blended(after, entering, limit, motion, still, "", found, cut)
 
     def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
         """A frame without a history."""
         color, length = without_history(entering), torch.ones_like(entering[:, :1])
-        return _Blended(color, length, self._first(frame, entering), entering, limit, limit, seen, None, False, reset)
+        after = _history(frame, color, length, limit, self._first(frame, entering), seen)
+        return _Blended(after, entering, limit, None, False, reset)
 
     def _lasting(self, frame: Frame, history: History | None, found: _Blended) -> tuple[Tensor | None, Output | None]:
         """How much light lasts, for the next frame; and what of this frame passes the method, ``None`` for nothing."""
@@ -414,7 +399,13 @@ class Accumulated(Wrapper):
         ]
 
 
-def _steady(color: Tensor) -> Tensor:
-    """The pixels in which the compressed radiance of a history has hardly varied."""
-    mean = color[:, MEAN]
-    return color[:, SQUARE] - mean.square() <= (_STEADY * mean).square()
+def _history(
+    frame: Frame, color: Tensor, length: Tensor, limit: Tensor, carried: _Carried, seen: Tensor | None
+) -> History:
+    """The history with a frame that sees lights there, of which those count whose radiance has hardly varied."""
+    # In most frames no light is seen, and all labels are 0.
+    if seen is not None and not (at_hand(seen.device) and not seen.any()):
+        mean = color[:, MEAN]
+        seen = seen * (color[:, SQUARE] - mean.square() <= (_STEADY * mean).square())
+    surface = Surface(frame.position, frame.normal, frame.depth, seen)
+    return History(color, length, surface, frame.view_projection, limit, carried)
