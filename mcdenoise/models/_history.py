@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -56,19 +56,19 @@ class Reprojected(NamedTuple):
     notes: tuple[Note, ...]
 
 
-def reset_of(frame: Frame, image: Tensor | None, view_projection: Tensor | None) -> str:
+def reset_of(frame: Frame, before: Any) -> str:
     """Why a frame cannot continue a history; empty if it can.
 
     Args:
         frame: the current frame.
-        image: any image of the frame before; ``None`` if there was none.
-        view_projection: camera of the frame before.
+        before: what is kept of the frame before, a named tuple that begins with an image and has a
+            ``view_projection``; ``None`` if there was none.
     """
-    if image is None:
+    if before is None:
         return "first frame" if tells_motion(frame.buffers) else NO_MOTION
-    if image.shape[2:] != frame.color.shape[2:]:
+    if before[0].shape[2:] != frame.color.shape[2:]:
         return "size change"
-    told = frame.motion is not None or (tells_motion(frame.buffers) and view_projection is not None)
+    told = frame.motion is not None or (tells_motion(frame.buffers) and before.view_projection is not None)
     return "" if told else NO_MOTION
 
 
@@ -86,12 +86,12 @@ def reprojected(frame: Frame, state: State, channels: int, keeper: str, *, sharp
         InputError: the state belongs to another method.
     """
     before = own_state(state, Past, frame, channels=channels, keeper=keeper)
-    reset = reset_of(frame, *((None, None) if before is None else (before.image, before.view_projection)))
+    reset = reset_of(frame, before)
     if before is None or reset:
         shape = (frame.color.shape[0], channels, *frame.size)
         none = torch.zeros_like(frame.color[:, :1])
         return Reprojected(frame.color.new_zeros(shape), none, _notes(frame, reset, 0.0))
-    motion = motion_unless_still(frame, before.view_projection)
+    motion, _ = motion_unless_still(frame, before.view_projection)
     found, weight = reproject(before.image, motion, *comparable(surface_before(frame), before.surface))
     if sharp and motion is not None:
         whole = weight > 1 - _ROUNDED * torch.finfo(weight.dtype).eps

@@ -35,23 +35,15 @@ def motion_to_previous(frame: Frame, previous_view_projection: Tensor | None) ->
     return motion_from_position(position, previous_view_projection)
 
 
-def motion_unless_still(
-    frame: Frame, previous_view_projection: Tensor | None, still: bool | Tensor | None = None
-) -> Tensor | None:
-    """Motion as :func:`motion_to_previous` has it where something moves; else ``None``.
-
-    Args:
-        frame: the current frame.
-        previous_view_projection: see :func:`motion_to_previous`.
-        still: result of :func:`is_still`, if that is known already.
-    """
-    still = is_still(frame, previous_view_projection) if still is None else still
-    if isinstance(still, Tensor):
-        motion = motion_to_previous(frame, previous_view_projection)
-        return None if motion is None else torch.where(still, 0, motion)
-    if still and not (frame.hints.keep_all and frame.motion is not None):
-        return None
-    return motion_to_previous(frame, previous_view_projection)
+def motion_unless_still(frame: Frame, previous_view_projection: Tensor | None) -> tuple[Tensor | None, bool | Tensor]:
+    """Motion as :func:`motion_to_previous` has it where something moves, else ``None``; and :func:`is_still`."""
+    still = is_still(frame, previous_view_projection)
+    if still is True and not (frame.hints.keep_all and frame.motion is not None):
+        return None, still
+    motion = motion_to_previous(frame, previous_view_projection)
+    if isinstance(still, Tensor) and motion is not None:
+        motion = torch.where(still, 0, motion)
+    return motion, still
 
 
 def comparable(surface: Surface, previous: Surface) -> tuple[Surface, Surface]:

@@ -16,7 +16,7 @@ from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, 
 from mcdenoise.models._history import NO_MOTION, reset_of
 from mcdenoise.models._interface import GUIDES, Model, Note, Output, State
 from mcdenoise.models._layers import alpha_of, completed
-from mcdenoise.models._motion import comparable, is_still, motion_unless_still, surface_before
+from mcdenoise.models._motion import comparable, motion_unless_still, surface_before
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
@@ -228,9 +228,8 @@ class Accumulated(Wrapper):
 
     def _reset(self, frame: Frame, history: History | None) -> str:
         """Why the frame cannot have this history; empty if it can, unless there is a cut."""
-        if history is None:
-            return reset_of(frame, None, None)
-        return reset_of(frame, history.length, history.view_projection) or self._other_buffers(history, frame)
+        reset = reset_of(frame, history)
+        return reset if history is None else reset or self._other_buffers(history, frame)
 
     def _blended(self, frame: Frame, history: History | None, reset: str, compared: bool) -> _Blended:
         """The frame with its history, where it has one and there is no cut."""
@@ -243,8 +242,7 @@ class Accumulated(Wrapper):
         seen = lights(entering[:, MEAN]) if compared else None
         if history is None:
             return self._begun(frame, entering, limit, seen, reset)
-        still = is_still(frame, history.view_projection)
-        motion = motion_unless_still(frame, history.view_projection, still)
+        motion, still = motion_unless_still(frame, history.view_projection)
         color, length, kept = self._blend(frame, entering, history.color, seen, history, motion)
         found, cut = kept.mean(), (kept < CUT_FRACTION)[:, None, None, None]
         if not blind and cut.any():

@@ -58,7 +58,7 @@ class Svgf(nn.Module):
         entering = with_carried(frame).to(accumulator_dtype(frame.color.dtype))
         # Light that was accumulated and filtered once, with layers and alpha; two moments; and the length, in frames.
         past = own_state(state, Past, frame, channels=entering.shape[1] + 3, keeper="svgf")
-        reset = reset_of(frame, past and past.image, past and past.view_projection)
+        reset = reset_of(frame, past)
         light, moments, length = self._accumulate(frame, entering, None if reset else past)
         variance = variance_of(moments, length, frame)
         filtered, kept = light, light
@@ -76,7 +76,7 @@ class Svgf(nn.Module):
         entering = torch.cat([light, luminance_moments(light[:, :3].clamp_max(BRIGHTEST))], 1)
         if past is None:
             return light, entering[:, -2:], torch.ones_like(light[:, :1])
-        both, length = self._blend(frame, entering, past, motion_unless_still(frame, past.view_projection))
+        both, length = self._blend(frame, entering, past, motion_unless_still(frame, past.view_projection)[0])
         return both[:, :-2], both[:, -2:], length
 
     def _blend(self, frame: Frame, entering: Tensor, past: Past, motion: Tensor | None) -> tuple[Tensor, Tensor]:
