@@ -13,11 +13,10 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
 from mcdenoise.models._interface import Model
 from mcdenoise.models._wrapper import parts_of
-from mcdenoise.models.tiled import Region, Tiled
+from mcdenoise.models.tiled import TILE, Region, Tiled
 
 GB = 1e9
 LEAST_SIDE = 64
-MULTIPLE = 32
 # Smaller tiles cost more time, because of their margins, than reading at the same time can save.
 _WORTHWHILE_SIDE = 512
 # Default memory for the features of a network: a frame of 1920x1080 is one piece for every model of the package, and
@@ -55,8 +54,8 @@ class Division:
 
     def __init__(self, model: Model, side: int | None, max_memory: float | None, device: torch.device) -> None:
         self._tiled = [tiled for tiled in parts_of(model, Tiled) if tiled.halo is not None]
-        if side is not None and (side < LEAST_SIDE or side % MULTIPLE):
-            raise InputError(f"tile: expected a multiple of {MULTIPLE} of at least {LEAST_SIDE} pixels, found {side}")
+        if side is not None and (side < LEAST_SIDE or side % TILE):
+            raise InputError(f"tile: expected a multiple of {TILE} of at least {LEAST_SIDE} pixels, found {side}")
         if side is not None and max_memory is not None:
             raise InputError("tile, max_memory: expected one of them, found both; max_memory chooses the tiles")
         if max_memory is not None and not 0 < max_memory < math.inf:
@@ -67,7 +66,6 @@ class Division:
         self._cap = None if max_memory is None else max_memory * GB
         self._loaded = _memory_in_use(device)
         self._halo = max((tiled.halo or 0 for tiled in self._tiled), default=0)
-        self._last: tuple[Frames, tuple[int | None, str]] | None = None
 
     def divide(self, frames: Frames) -> str:
         """Choose the tiles of the next frame; says which, and why.
@@ -77,10 +75,7 @@ class Division:
         """
         if not self._tiled:
             return "whole frames: the model computes no tiles"
-        # The frames of a shot are alike.
-        if self._last is None or self._last[0] != frames:
-            self._last = frames, self.chosen(frames)
-        side, reason = self._last[1]
+        side, reason = self.chosen(frames)
         for tiled in self._tiled:
             tiled.side = side
         return reason
@@ -121,12 +116,10 @@ class Division:
                 )
             limit = self._cap - self._loaded - frames.held
             why = f"all within {self._cap / GB:g} GB"
-        side = -(-max(frames.size) // MULTIPLE) * MULTIPLE
-        if self._features(frames, side) <= limit:
-            return None, f"whole frames: {why}"
-        while side > LEAST_SIDE and self._features(frames, side) > limit:
-            side -= MULTIPLE
-        return side, f"{describe(frames.size, side)}: {why}"
+        whole = -(-max(frames.size) // TILE) * TILE
+        fitting = (side for side in range(whole, LEAST_SIDE, -TILE) if self._features(frames, side) <= limit)
+        side = next(fitting, LEAST_SIDE)
+        return (None, f"whole frames: {why}") if side >= whole else (side, f"{describe(frames.size, side)}: {why}")
 
     def _least(self, frames: Frames, side: int) -> float:
         """Bytes that are needed with tiles of a side."""
