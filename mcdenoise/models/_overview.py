@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from typing import Any, get_args
 
 import torch
@@ -13,6 +13,7 @@ from torch import nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
 from mcdenoise.models._entries import Kind
+from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import build_model, find_model, list_models, needs_of_models
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.own import refused
@@ -84,7 +85,7 @@ def _overview(name: str, weights: str) -> ModelOverview:
             weights = weights or ("to train" if needs.trainable else "its own")
             return listed(
                 parameters=parameters,
-                kmacs_per_pixel=_kmacs_per_pixel(name, entry.construct) if parameters else None,
+                kmacs_per_pixel=_kmacs_per_pixel(model) if parameters else None,
                 weights=weights if parameters else "none",
                 needs=sorted(needs.buffers),
                 uses=sorted(needs.uses),
@@ -94,21 +95,14 @@ def _overview(name: str, weights: str) -> ModelOverview:
         return listed(reason=str(error))
 
 
-# The constructor is part of the cache key, because another model may be registered under the same name.
-@cache
-def _kmacs_per_pixel(name: str, _: object) -> float:
+def _kmacs_per_pixel(model: Model) -> float:
     # The import takes 0.2 s.
     from torch.utils.flop_counter import FlopCounterMode
 
-    model = build_model(name)
-    # The counter knows torch's convolutions but not the fused ones, which run only without derivatives.
-    with FlopCounterMode(display=False) as counter, torch.enable_grad():
-        model(_frame())
-    return float(counter.get_total_flops()) / 2 / _SIDE**2 / 1e3
-
-
-def _frame() -> Frame:
     images: dict[str, Any] = {
         name: torch.rand(1, BUFFERS[name].channels, _SIDE, _SIDE) for name in ("color", "albedo", "normal", "depth")
     }
-    return Frame(**images, motion=torch.zeros(1, 2, _SIDE, _SIDE))
+    # The counter knows torch's convolutions but not the fused ones, which run only without derivatives.
+    with FlopCounterMode(display=False) as counter, torch.enable_grad():
+        model(Frame(**images, motion=torch.zeros(1, 2, _SIDE, _SIDE)))
+    return float(counter.get_total_flops()) / 2 / _SIDE**2 / 1e3
