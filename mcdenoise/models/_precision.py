@@ -8,12 +8,12 @@ import statistics
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import check_choice
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._wrapper import Wrapper, parts_of
@@ -21,7 +21,7 @@ from mcdenoise.nn.oidn import OidnUNet
 from mcdenoise.user_cache import measured_once
 
 Precision = Literal["float32", "bfloat16"]
-PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 # A fixed precision for callers that need the same result on every machine, unlike "auto".
 ENVIRONMENT = "MCDENOISE_PRECISION"
 # Minimum speed-up of bfloat16; a smaller one is not worth the rounding.
@@ -49,11 +49,10 @@ def fastest_precision(device: torch.device) -> Chosen:
     Raises:
         InputError: the environment variable does not name a precision.
     """
-    if own := os.environ.get(ENVIRONMENT):
-        for known in PRECISIONS:
-            if own == known:
-                return Chosen(known, f"the environment variable {ENVIRONMENT} says so")
-        raise InputError(f"{ENVIRONMENT}: expected one of {', '.join(PRECISIONS)}, found '{own}'")
+    own: Any = os.environ.get(ENVIRONMENT)
+    if own:
+        check_choice(ENVIRONMENT, own, Precision)
+        return Chosen(own, f"the environment variable {ENVIRONMENT} says so")
     if not _has_bfloat16(device):
         return Chosen("float32", "the processor has no bfloat16")
     ratio = measured_once("precision.json", _machine(device), lambda: _measured(device))
