@@ -36,12 +36,12 @@ def own_state(
     """
     if state is None:
         return None
+    keeper = keeper or _file_of(kind)
     if type(state) is not kind:
-        expected = keeper or _file_of(kind)
-        raise InputError(f"state: expected what {expected} keeps of a frame, found {_described(state)}; {ADVICE}")
+        raise _foreign(f"what {keeper} keeps of a frame", state)
     # An exported graph has its own state, for any batch size.
     if not torch.compiler.is_compiling():
-        _check_tensors(state, keeper or _file_of(kind), frame, channels)
+        _check_tensors(state, keeper, frame, channels)
     return state
 
 
@@ -58,10 +58,7 @@ def own_pair(state: State, keeper: str) -> tuple[State, State]:
     if state is None:
         return None, None
     if type(state) not in (tuple, list) or len(state) != 2:
-        raise InputError(
-            f"state: expected what {keeper} keeps of a frame and what the method inside keeps, found "
-            f"{_described(state)}; {ADVICE}"
-        )
+        raise _foreign(f"what {keeper} keeps of a frame and what the method inside keeps", state)
     return state[0], state[1]
 
 
@@ -74,9 +71,12 @@ def own_parts(state: State, names: tuple[str, ...]) -> dict[str, State]:
     if state is None:
         return dict.fromkeys(names)
     if not isinstance(state, dict) or set(state) != set(names):
-        wanted = ", ".join(names)
-        raise InputError(f"state: expected what each of {wanted} keeps of a frame, found {_described(state)}; {ADVICE}")
+        raise _foreign(f"what each of {', '.join(names)} keeps of a frame", state)
     return dict(state)
+
+
+def _foreign(expected: str, state: State) -> InputError:
+    return InputError(f"state: expected {expected}, found {_described(state)}; {ADVICE}")
 
 
 def _check_tensors(state: State, keeper: str, frame: Frame, channels: int | None) -> None:
@@ -112,8 +112,8 @@ def _described(state: State) -> str:
     """Name the method that a state belongs to, as far as its type tells."""
     if isinstance(state, dict):
         return f"what each of {', '.join(map(str, state)) or 'nothing'} keeps"
-    if isinstance(state, tuple | list) and not hasattr(state, "_fields"):
+    if hasattr(state, "_fields"):
+        return f"what {_file_of(type(state))} keeps"
+    if isinstance(state, tuple | list):
         return f"({', '.join(map(_described, state))})"
-    if state is None or not hasattr(state, "_fields"):
-        return "None" if state is None else type(state).__name__
-    return f"what {_file_of(type(state))} keeps"
+    return "None" if state is None else type(state).__name__
