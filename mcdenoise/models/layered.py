@@ -29,7 +29,6 @@ in both layers in proportion to its weights.
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
@@ -74,7 +73,7 @@ class LayeredNetwork(Network):
         self.embedding = SampleEmbedding(CHANNELS, width, 1, convolutions)
         self.partition = chain([2 * width, width, LAYERS], linear=True)
         self.unet = LeakyUNet((LAYERS + 1) * width, width, convolutions)
-        self.head = chain([width, LAYERS * self.taps + LAYERS - 1], linear=True)
+        self.head = chain([width, LAYERS * self.taps + 1], linear=True)
         reach = 2 * LeakyUNet.reach(convolutions) + kernel_size // 2
         # Measured at the default's sizes, with eight samples and the history: 6.4 kB a pixel.
         live = Live(width * (6 * PLANNED + 12) + 2 * LAYERS * self.taps)
@@ -92,21 +91,16 @@ class LayeredNetwork(Network):
         layers = weights.split(1, 2)
         embeddings = [(embedded * weight.to(embedded.dtype)).mean(1) for weight in layers]
         predicted = self.head(self.unet(torch.cat([*embeddings, context], 1))).to(light.dtype)
-        *kernels, alphas = predicted.split([self.taps] * LAYERS + [LAYERS - 1], 1)
-        seen_through: Tensor | float = 1.0
-        image = torch.zeros((), dtype=light.dtype, device=light.device)
-        for number, (kernel, weight) in enumerate(zip(kernels, layers, strict=True)):
+        *kernels, alpha = predicted.split([self.taps] * LAYERS + [1], 1)
+        means = []
+        for kernel, weight in zip(kernels, layers, strict=True):
             coverage = weight.mean(1)
             held = [(light * weight).mean(1), coverage]
             held = held if others is None else [*held, others.to(light.dtype) * coverage]
             found = cross_bilateral_filter(torch.cat(held, 1), kernel, border="renormalize")
-            mean = torch.cat([found[:, :3], found[:, 4:]], 1) / found[:, 3:4]
-            if number == LAYERS - 1:
-                image = image + seen_through * mean
-            else:
-                alpha = torch.sigmoid(alphas[:, number : number + 1])
-                image = image + seen_through * alpha * mean
-                seen_through = seen_through * (1 - alpha)
+            means.append(torch.cat([found[:, :3], found[:, 4:]], 1) / found[:, 3:4])
+        (front, back), alpha = means, torch.sigmoid(alpha)
+        image = alpha * front + (1 - alpha) * back
         return answered(frame, image).noted(Note("samples", describe_samples(frame))), None
 
 
