@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from mcdenoise import Denoiser, Frame, InputError, list_models, ops
 from mcdenoise.check.cases import OPS
 from mcdenoise.models import describe_weights
-from mcdenoise.models._registry import find_model
 
 DEFAULTS = ["float64", "meta"]
 
@@ -38,7 +37,7 @@ def denoised(name: str, frames: list[Frame]) -> list[Tensor]:
     return [denoiser(frame) for frame in frames]
 
 
-@pytest.mark.parametrize("model", [name for name in list_models() if find_model(name).installed])
+@pytest.mark.parametrize("model", list_models())
 def test_a_model_is_made_and_denoises_alike(model: str) -> None:
     frames = random_shot(0, 40, 48, 2)
     try:

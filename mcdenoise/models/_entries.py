@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +24,6 @@ class Entry:
         description: one line.
         kind: how the model makes its image.
         paper: authors and year; empty if there is none.
-        requires: the optional package that the model needs; empty if there is none.
     """
 
     construct: Callable[..., Any]
@@ -33,12 +31,6 @@ class Entry:
     description: str
     kind: Kind = "other"
     paper: str = ""
-    requires: str = ""
-
-    @property
-    def installed(self) -> bool:
-        """Whether the required package is installed."""
-        return not self.requires or importlib.util.find_spec(self.requires) is not None
 
     @property
     def of_zoo(self) -> bool:
@@ -57,7 +49,7 @@ MODELS: dict[str, Entry] = {}
 
 
 def register_model(
-    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", requires: str = "", **settings: Any
+    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", **settings: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that registers a model's constructor under ``name``.
 
@@ -69,7 +61,6 @@ def register_model(
         description: one line; by default the first line of the constructor's docstring.
         kind: how the model makes its image.
         paper: authors and year, such as "Schied et al. 2017".
-        requires: the optional package that the model needs.
         settings: arguments for the constructor under this name.
 
     Raises:
@@ -81,7 +72,7 @@ def register_model(
         if name in MODELS:
             raise ValueError(f"model '{name}' is registered twice")
         about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
-        MODELS[name] = Entry(constructor, settings, about, kind, paper, requires)
+        MODELS[name] = Entry(constructor, settings, about, kind, paper)
         return constructor
 
     return enter

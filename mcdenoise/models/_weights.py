@@ -65,8 +65,8 @@ def find_weights(name: str) -> Path | None:
 
 
 def pretrained_models() -> list[str]:
-    """Sorted names of the models with shipped weights for denoising whose optional packages are installed."""
-    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if find_model(path.stem).installed)
+    """Sorted names of the models with shipped weights for denoising."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.safetensors"))
 
 
 def compared_models() -> list[str]:
@@ -293,11 +293,7 @@ def describe_weights(path: Path) -> dict[str, Any]:
         settings = dict(json.loads(metadata.get("settings", "{}")))
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: header 'settings': expected a JSON object, found other text") from error
-    return {
-        "architecture": metadata["architecture"],
-        "settings": settings,
-        **{key: value for key, value in metadata.items() if key not in ("architecture", "settings")},
-    }
+    return {**metadata, "settings": settings}
 
 
 def save_weights(model: Model, architecture: str, settings: dict[str, Any], about: dict[str, str]) -> bytes:

@@ -176,7 +176,7 @@ class Oidn(Filters):
             raise RuntimeError(f"Open Image Denoise: {message}")
 
 
-@register_model("oidn", kind="peer", requires="pyoidn")
+@register_model("oidn", kind="peer")
 def oidn(
     *,
     quality: Quality = "high",

@@ -195,7 +195,7 @@ def archive_of_library(
     raise InputError(f"{path}: expected the weights that the library denoises with, found none")
 
 
-@register_model("oidn_open", kind="peer", requires="pyoidn")
+@register_model("oidn_open", kind="peer")
 def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", archive: Path | str | None = None) -> Model:
     """Open Image Denoise's network in torch: differentiable (weights of the optional package pyoidn, or a .tza file).
 

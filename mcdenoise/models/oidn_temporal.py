@@ -42,7 +42,7 @@ def mixed(oidn: Tensor, oidn_clean: Tensor | None = None) -> Tensor:
     return oidn if oidn_clean is None else (oidn + _CLEAN_PART * oidn_clean) / (1 + _CLEAN_PART)
 
 
-@register_model("oidn_temporal", kind="peer", requires="pyoidn")
+@register_model("oidn_temporal", kind="peer")
 def oidn_temporal(
     *,
     quality: Quality = "high",
