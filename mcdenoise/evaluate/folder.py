@@ -33,7 +33,7 @@ from mcdenoise.metrics import (
     warping_error_srgb,
 )
 from mcdenoise.metrics.protocols import ProtocolName
-from mcdenoise.models._motion import motion_to_previous, surface_before
+from mcdenoise.models._history import motion_to_previous, surface_before
 from mcdenoise.ops import Surface
 
 STRICT: ProtocolName = "strict"

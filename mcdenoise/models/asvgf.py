@@ -42,9 +42,8 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
-from mcdenoise.models._history import Past
+from mcdenoise.models._history import Past, surface_before
 from mcdenoise.models._interface import Model
-from mcdenoise.models._motion import surface_before
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient

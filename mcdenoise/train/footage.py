@@ -18,7 +18,7 @@ from mcdenoise.data.shards import ERROR, Shard
 from mcdenoise.errors import InputError, level_of_caller
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
-from mcdenoise.models._motion import motion_to_previous
+from mcdenoise.models._history import motion_to_previous
 from mcdenoise.train.cache import Keep, open_cache
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Array, Shot

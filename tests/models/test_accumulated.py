@@ -77,7 +77,7 @@ def test_each_image_of_a_batch_is_a_shot_of_its_own(in_graph: bool, monkeypatch:
     """One stands still, one moves, and one cuts to caustics."""
     if in_graph:
         monkeypatch.setattr("mcdenoise.models.accumulated.at_hand", lambda device: False)
-        monkeypatch.setattr("mcdenoise.models._motion.at_hand", lambda device: False)
+        monkeypatch.setattr("mcdenoise.models._history.at_hand", lambda device: False)
 
     def images(model: Accumulated, shots: Sequence[Sequence[Frame]]) -> Tensor:
         state, found = None, []
