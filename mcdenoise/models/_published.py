@@ -51,6 +51,16 @@ def as_published(method: Model, alpha_min: float = ALPHA) -> Model:
     )
 
 
+def behind(wrap: Callable[[Model], Model], method: Callable[..., Model]) -> Callable[..., Model]:
+    """A constructor of a method inside a wrapper, with the settings of the method."""
+
+    @functools.wraps(method, updated=())
+    def made(*settings: Any, **named: Any) -> Model:
+        return wrap(method(*settings, **named))
+
+    return made
+
+
 def published(network: Callable[..., Model]) -> Callable[..., Model]:
     """A constructor of a network, or of a chain of tiled ones, behind exposure and :func:`as_published`.
 
@@ -62,9 +72,9 @@ def published(network: Callable[..., Model]) -> Callable[..., Model]:
         inner = network(*sizes, **named)
         return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), alpha_min)
 
-    own, added = inspect.signature(network), inspect.Parameter("alpha_min", inspect.Parameter.KEYWORD_ONLY)
-    every = [*own.parameters.values(), added.replace(default=ALPHA)]
-    made.__signature__ = own.replace(parameters=every)  # type: ignore[attr-defined]
+    own = inspect.signature(network)
+    added = inspect.Parameter("alpha_min", inspect.Parameter.KEYWORD_ONLY, default=ALPHA, annotation="float")
+    made.__signature__ = own.replace(parameters=[*own.parameters.values(), added])  # type: ignore[attr-defined]
     return made
 
 

@@ -40,9 +40,9 @@ from torch import Tensor, nn
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
-from mcdenoise.models._interface import GUIDES, Model, Needs, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._published import Network
+from mcdenoise.models._published import Network, behind
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.nn.inputs import features_of, normalized_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
@@ -56,7 +56,7 @@ _SAMPLE = 10  # radiance 3, albedo 3, normal 3, depth 1
 
 
 class Anf(Network):
-    """The method, for demodulated radiance.
+    """Affinity of neural features (Isik et al. 2021), for demodulated radiance.
 
     Args:
         width: channels of the embedding, the paper's 32, and of the U-Net.
@@ -130,16 +130,9 @@ class Anf(Network):
         return total
 
 
-@register_model(
+anf = register_model(
     "anf",
     "pairwise affinity of learnt features, dilated filters; sizes of a public copy",
     kind="recurrent",
     paper="Isik et al. 2021",
-)
-def anf(width: int = 32) -> Model:
-    """Affinity of neural features (Isik et al. 2021).
-
-    Args:
-        width: channels of the embedding, the paper's 32, and of the U-Net.
-    """
-    return Demodulated(Anf(width))
+)(behind(Demodulated, Anf))

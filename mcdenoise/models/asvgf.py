@@ -43,7 +43,7 @@ from torch import Tensor
 from mcdenoise.frame import Frame
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, surface_before
-from mcdenoise.models._interface import Model
+from mcdenoise.models._published import behind
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient
@@ -53,7 +53,7 @@ GRADIENT = "gradient"
 
 
 class Asvgf(Svgf):
-    """SVGF with temporal gradients.
+    """SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.
 
     Args:
         alpha: smallest weight of the current frame where nothing changes, in (0, 1].
@@ -99,11 +99,4 @@ class Asvgf(Svgf):
         return torch.lerp(both, entering, change), 1 / (change + (1 - change) / length)
 
 
-@register_model("asvgf", kind="filter", paper="Schied et al. 2018")
-def asvgf(*, alpha: float = 0.1) -> Model:
-    """SVGF with temporal gradients of Schied et al. 2018: by re-shaded samples where a frame has them, else by a test.
-
-    Args:
-        alpha: see :class:`Asvgf`.
-    """
-    return Demodulated(Asvgf(alpha=alpha))
+asvgf = register_model("asvgf", kind="filter", paper="Schied et al. 2018")(behind(Demodulated, Asvgf))

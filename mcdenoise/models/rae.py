@@ -42,7 +42,8 @@ from torch import Tensor, nn
 from mcdenoise.frame import MOTION, Frame, tells_motion
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
+from mcdenoise.models._published import behind
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated
@@ -82,10 +83,10 @@ class _Recurrent(nn.Module):
 
 
 class Rae(nn.Module):
-    """The network, for exposed and demodulated radiance.
+    """The recurrent denoising autoencoder of Chaitanya et al. 2017, re-implemented, for exposed, demodulated radiance.
 
     Args:
-        width: channels of the first stage, the paper's 32.
+        width: channels of the first stage, the paper's 32; each further stage has 4/3 of the previous one's.
     """
 
     # Motion is for detecting cuts.
@@ -190,16 +191,9 @@ def _leaky(x: Tensor) -> Tensor:
     return F.leaky_relu(x, SLOPE)
 
 
-@register_model(
+rae = register_model(
     "rae",
     "a re-implementation of the recurrent autoencoder; stands for OptiX 5.1 (ONND)",
     kind="recurrent",
     paper="Chaitanya et al. 2017",
-)
-def rae(width: int = 32) -> Model:
-    """The recurrent denoising autoencoder of Chaitanya et al. 2017, re-implemented.
-
-    Args:
-        width: channels of the first stage, the paper's 32; each further stage has 4/3 of the previous one's.
-    """
-    return Demodulated(Exposed(Rae(width)))
+)(behind(lambda network: Demodulated(Exposed(network)), Rae))

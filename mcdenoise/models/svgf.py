@@ -19,8 +19,9 @@ from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, motion_unless_still, reset_of, surface_before
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
+from mcdenoise.models._published import behind
 from mcdenoise.models._state import own_state
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import accumulate, atrous, luminance_moments, moments_variance
@@ -34,7 +35,9 @@ BRIGHTEST = 1e18
 
 
 class Svgf(nn.Module):
-    """Accumulates light and its moments, and filters it as far as its variance asks for.
+    """Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.
+
+    It accumulates light and its moments, and filters it as far as its variance asks for.
 
     Args:
         alpha: smallest weight of the current frame, of light and of moments, in (0, 1].
@@ -97,11 +100,4 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
     return torch.lerp(moments_variance(moments), few, (_FEW_FRAMES - length).clamp(0, 1))
 
 
-@register_model("svgf", kind="filter", paper="Schied et al. 2017")
-def svgf(*, alpha: float = 0.2) -> Model:
-    """Spatiotemporal variance-guided filtering of Schied et al. 2017, on demodulated light.
-
-    Args:
-        alpha: see :class:`Svgf`.
-    """
-    return Demodulated(Svgf(alpha=alpha))
+svgf = register_model("svgf", kind="filter", paper="Schied et al. 2017")(behind(Demodulated, Svgf))
