@@ -10,18 +10,18 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, check_choice
 from mcdenoise.frame import Frame
 from mcdenoise.models._contract import check_needs
 from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._tza import Archive, archives_in, read_tza
-from mcdenoise.models.oidn import Auxiliary, Filters, Oidn, Quality, library_of_oidn
+from mcdenoise.models.oidn import Filters, Oidn, Quality, library_of_oidn
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
 from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
@@ -142,7 +142,7 @@ class OpenFilters(Filters):
         key = "-".join([*images, quality, str(clean)])
         if key not in self.networks:
             made = _made(images, quality, clean)
-            load_archive(made.unet, archive_of_library(quality, "clean" if clean else "noisy", images), "pyoidn")
+            load_archive(made.unet, archive_of_library(quality, clean, images), "pyoidn")
             made.eval().requires_grad_(False)
             self.networks[key] = Tiled(made, border=0) if isinstance(made, OidnOpen) else made
         return self.networks[key]
@@ -163,22 +163,19 @@ def _run(network: Any, images: Mapping[str, Any]) -> Tensor:
 
 
 @functools.cache
-def archive_of_library(
-    quality: Quality = "high", auxiliary: Auxiliary = "noisy", images: tuple[str, ...] = _IMAGES
-) -> Archive:
+def archive_of_library(quality: Quality, clean: bool, images: tuple[str, ...]) -> Archive:
     """The weights that the installed library uses for HDR color with these features, or for a single feature.
 
     The library contains them without names; they are identified by comparing a denoised image with the library's own.
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise; "prefiltered" uses the weights of "clean".
+        clean: whether the features of the color count as clean.
         images: names of the images: color, and its features if there are any; or albedo or normal alone.
 
     Raises:
         InputError: the package ``pyoidn`` is not installed, or its library has no such weights.
     """
-    clean = auxiliary != "noisy"
     generator = torch.Generator().manual_seed(0)
     probe: dict[str, Any] = {name: torch.rand(1, 3, _PROBE, _PROBE, generator=generator) for name in images}
     wanted = Oidn(quality, threads=1).filtered(probe, quality, clean=clean)
@@ -196,21 +193,24 @@ def archive_of_library(
 
 
 @register_model("oidn_open", kind="peer")
-def oidn_open(*, quality: Quality = "high", auxiliary: Auxiliary = "noisy", archive: Path | str | None = None) -> Model:
+def oidn_open(
+    *, quality: Quality = "high", auxiliary: Literal["noisy", "clean"] = "noisy", archive: Path | str | None = None
+) -> Model:
     """Open Image Denoise's network in torch: differentiable (weights of the optional package pyoidn, or a .tza file).
 
     Args:
         quality: see :class:`mcdenoise.models.oidn.Oidn`.
-        auxiliary: likewise, except that "prefiltered" is rejected.
+        auxiliary: whether albedo and normal count as noisy or as clean.
         archive: a file of weights (``.tza``) to use instead of the library's, for the network of this quality.
 
     Raises:
-        InputError: the package is not installed, or the file is no such archive.
+        InputError: a setting is none of these, the package is not installed, or the file is no such archive.
     """
-    if auxiliary == "prefiltered":
-        raise InputError("auxiliary: expected noisy or clean, found 'prefiltered'")
-    model = _made(_IMAGES, quality, auxiliary == "clean")
+    check_choice("quality", quality, Quality)
+    check_choice("auxiliary", auxiliary, Literal["noisy", "clean"])
+    clean = auxiliary == "clean"
+    model = _made(_IMAGES, quality, clean)
     assert isinstance(model, OidnOpen)
-    weights = archive_of_library(quality, auxiliary) if archive is None else read_tza(Path(archive))
+    weights = archive_of_library(quality, clean, _IMAGES) if archive is None else read_tza(Path(archive))
     load_archive(model.unet, weights, str(archive or "pyoidn"))
     return Tiled(model)

@@ -103,7 +103,10 @@ def test_tiles_are_the_whole_image() -> None:
 
 @has_oidn
 def test_refuses_unsupported_options() -> None:
-    assert "found 'prefiltered'" in refused(lambda: create_model(NAME, auxiliary="prefiltered"))
+    for name, value in (("auxiliary", "prefiltered"), ("auxiliary", "none"), ("quality", "low")):
+        message = refused(lambda name=name, value=value: create_model(NAME, **{name: value}))
+        assert f"{name}: expected one of" in message
+        assert value in message
     model = create_model(NAME)
     assert model.needs.missing(Frame(torch.rand(1, 3, 8, 8))) == ["albedo", "normal"]
 
