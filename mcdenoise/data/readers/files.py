@@ -49,6 +49,7 @@ class RenderedFiles(FrameSequence):
         choice: the layer of each buffer.
         cameras: contents of a ``camera_matrices.h`` beside the files.
         encoded_normals: whether normals are stored as ``n / 2 + 1 / 2``.
+        negative_depths: whether depths in front of the camera are stored as negative numbers.
         motion: how motion is stored.
         camera_convention: how the matrices of ``cameras`` are stored, see :func:`mcdenoise.motion.read_as`.
         positions_of_camera: whether positions are in the space of the camera, and brought to the world.
@@ -65,6 +66,7 @@ class RenderedFiles(FrameSequence):
     choice: Choice
     cameras: CameraMatrices | None = None
     encoded_normals: bool = False
+    negative_depths: bool = False
     motion: Convention = USUAL_MOTION
     camera_convention: str = ""
     positions_of_camera: bool = False
@@ -344,6 +346,8 @@ class RenderedFiles(FrameSequence):
         if name == "variance" and pixels.shape[2] < 3:
             return np.repeat(pixels[..., :1], 3, -1)
         pixels = pixels[..., : BUFFERS[name].channels]
+        if name == "depth" and self.negative_depths:
+            return -pixels
         return self.in_world(number, pixels) if name == "position" and self.positions_of_camera else pixels
 
     def in_world(self, number: int, position: Image) -> Image:

@@ -188,6 +188,16 @@ def test_every_background_of_depth_is_infinity(background: float, tmp_path: Path
     assert "background: 33%" in row.reading
 
 
+def test_depths_that_are_all_negative_are_negated(tmp_path: Path) -> None:
+    depth = np.linspace(2, 7, 12 * 16, dtype=np.float32).reshape(12, 16)
+    depth[:4] = 1e10
+    path = save(tmp_path / "a.exr", {**dict.fromkeys("RGB", np.ones((12, 16))), "Z": -depth})
+    frame = open_sequence(path).frame(0)
+    np.testing.assert_array_equal(frame.depth[0, 0].numpy(), np.where(depth < 1e9, depth, np.inf))
+    path = save(tmp_path / "sky.exr", {**dict.fromkeys("RGB", np.ones((12, 16))), "Z": np.full((12, 16), -1)})
+    assert open_sequence(path).frame(0).depth.isinf().all()
+
+
 def moving(shift: tuple[float, float], size: tuple[int, int] = (60, 100)) -> tuple[dict[str, Image], dict[str, Image]]:
     """Features of a frame and of the one before, in which every point was (x, y) pixels farther; y down."""
 
