@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -141,15 +141,13 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
         for channel in usable:
             prefix, dot, _ = channel.rpartition(".")
             if not dot and channel.lower() not in together:
-                # pbrt's `Nsx, Nsy, Nsz` are one layer, but `dzdx, dzdy` are not.
-                stem, three = channel[:-1], [channel[:-1] + letter for letter in "xyz"]
-                prefix = stem if stem and channel in three and set(three) <= set(usable) else channel
+                prefix = _stem(channel, usable) or channel
             channels.setdefault(prefix, []).append(channel)
         for prefix, own in channels.items():
             single = own == [prefix]
             components = ["" if single else channel.removeprefix(prefix).removeprefix(".").lower() for channel in own]
             order = sorted(range(len(own)), key=lambda place: (_ORDER.get(components[place], 9), place))
-            name = prefix
+            name = prefix.rstrip("_")
             if len(parts) > 1 and prefix and part.name.startswith(prefix):
                 # Blender writes each eye to its own part, with the same channels: `ViewLayer.Combined-left`.
                 eye = part.name.removeprefix(prefix).strip("-._ ")
@@ -166,6 +164,20 @@ def layers_of(group: int, label: str, parts: Sequence[Part]) -> list[Layer]:
         if not only.name or len(only.channels) == 1 or (says is not None and says[1] <= _ROOT_RANK):
             return [picture]
     return found
+
+
+def _stem(channel: str, channels: Collection[str]) -> str:
+    """The name of a channel without its last letter, if that alone tells it from the others of its layer.
+
+    pbrt's `Nsx, Nsy, Nsz` are one layer, as `albedo_R, albedo_G, albedo_B` and `motion_x, motion_y` are; `dzdx, dzdy`
+    are not.
+    """
+    stem, last = channel[:-1], channel[-1:]
+    for letters in ("xyzw", "XYZW", "rgba", "RGBA"):
+        least = 2 if stem.endswith("_") and "y" in letters.lower() else 3
+        if last in letters and {stem + letter for letter in letters[:least]} <= {*channels}:
+            return stem
+    return ""
 
 
 def read_files(

@@ -77,6 +77,9 @@ TABLE = {
         (three("VRayZDepth"), "VRayZDepth.RGB", "depth"),
         (three("effectsResult"), "effectsResult.RGB", None),
         (three("normalVariance"), "normalVariance.RGB", None),
+        ("R G B N_X N_Y N_Z", "N.XYZ", "normal"),
+        ("R G B albedo_R albedo_G albedo_B albedo_A", "albedo.RGBA", "albedo"),
+        ("R G B motion_x motion_y", "motion.XY", "motion"),
     ],
 }
 ROWS = [(renderer, *row) for renderer, rows in TABLE.items() for row in rows]
