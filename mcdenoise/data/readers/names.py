@@ -5,9 +5,9 @@ from __future__ import annotations
 import fnmatch
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mcdenoise.data.files import listed
@@ -117,7 +117,17 @@ def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
     groups: list[FileGroup] = []
     for (_, texts, _), members in alike.items():
         groups += _split_by_number(texts, members)
-    return with_stills(groups), "files"
+    return _named_by_folders(with_stills(groups)), "files"
+
+
+def _named_by_folders(groups: list[FileGroup]) -> list[FileGroup]:
+    """Name files of equal names in several folders after these: `albedo/0001.exr` beside `color/0001.exr`."""
+    folders = [_first(group).parent for group in groups]
+    count = Counter(label for label, _ in {(g.label, each) for g, each in zip(groups, folders, strict=True)})
+    return [
+        replace(group, label=folder.name) if count[group.label] > 1 else group
+        for group, folder in zip(groups, folders, strict=True)
+    ]
 
 
 def _split_by_number(texts: tuple[str, ...], members: list[tuple[Path, list[str]]]) -> list[FileGroup]:
@@ -175,9 +185,18 @@ def files_beside(path: Path) -> dict[str, Path]:
     return {" ".join(_DIGITS.split(other.stem)[::2]).strip(" ._-"): other for other in others}
 
 
+def patterns_of(groups: Sequence[FileGroup]) -> list[str]:
+    """The file names of all kinds, behind the name of the folder where several have the same."""
+    patterns = [pattern_of(group) for group in groups]
+    return [
+        f"{_first(group).parent.name}/{pattern}" if patterns.count(pattern) > 1 else pattern
+        for group, pattern in zip(groups, patterns, strict=True)
+    ]
+
+
 def pattern_of(group: FileGroup) -> str:
     """The file names of a kind, with # for the digits of the frame number."""
-    path = next(iter(group.files.values()))
+    path = _first(group)
     digits = list(_DIGITS.finditer(path.stem))
     if len(group.files) > 1:
         for place in range(len(digits) - 1, -1, -1):
@@ -186,3 +205,7 @@ def pattern_of(group: FileGroup) -> str:
                 start, end = digits[place].span()
                 return f"{path.name[:start]}{'#' * (end - start)}{path.name[end:]}"
     return path.name
+
+
+def _first(group: FileGroup) -> Path:
+    return next(iter(group.files.values()))

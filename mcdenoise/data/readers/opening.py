@@ -38,7 +38,7 @@ from mcdenoise.data.readers.examining import examine, examine_parts
 from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.data.readers.layers import Layer, layers_of, read_files, recognise
 from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
-from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of
+from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of, patterns_of
 from mcdenoise.data.readers.samples import SampleLayers, split_samples
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError
@@ -79,8 +79,8 @@ def open_files(
     first_files = [next(iter(group.files.values())) for group in groups]
     headers = [*map(read_image_header, first_files)]
     layers = [
-        replace(layer, files=pattern_of(group))
-        for i, (group, header) in enumerate(zip(groups, headers, strict=True))
+        replace(layer, files=pattern)
+        for i, (group, pattern, header) in enumerate(zip(groups, patterns_of(groups), headers, strict=True))
         for layer in layers_of(i, group.label, header.parts)
     ]
     samples, layers = split_samples(layers)

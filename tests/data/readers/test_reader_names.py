@@ -173,6 +173,14 @@ def test_buffers_of_a_still(names: list[str], image: Callable[..., list[Path]], 
     assert float(sequence.frame(sequence.numbers[0]).color[0, 0, 0, 0]) == 1
 
 
+def test_a_folder_for_each_buffer(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    image(*[f"{folder}/{number:04d}.exr" for folder in ("color", "albedo", "normal") for number in (1, 2)])
+    sequence = open_sequence([tmp_path / folder for folder in ("albedo", "color", "normal")])
+    taken = {row.buffer: row.source for row in sequence.table}
+    assert taken == {name: f"{name}/####.exr" for name in ("color", "albedo", "normal")}
+    assert float(sequence.frame(2).color[0, 0, 0, 0]) == 2
+
+
 def test_the_layout_of_oidn(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(
         *[f"training/{name}_0008spp.{kind}.exr" for name in ("bath", "kitchen") for kind in ("hdr", "alb", "nrm")],
