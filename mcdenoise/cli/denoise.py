@@ -161,9 +161,9 @@ def _denoise(
     print_times(report.milliseconds)
     print(f"{'beside that' if denoiser.has_room_ahead else 'of the waiting'}: {stages(report.beside)}")
     features = {"albedo", "normal", "depth"} & opened.buffers
-    missing = {name for done in report.frames.values() for name in done.missing} - (
-        MOTION if len(opened) == 1 else set()
-    )
+    # Behind a gap a frame has no motion, as a warning says.
+    missing = {name for done in report.frames.values() for name in done.missing} - opened.buffers
+    missing -= MOTION if len(opened) == 1 else set()
     if missing and features:
         those = "it" if len(missing) == 1 else "them"
         say(f"read without {', '.join(sorted(missing))}: {report.model} is better with {those}")
