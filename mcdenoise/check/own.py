@@ -123,8 +123,9 @@ def _examples(name: str, function: Any, module: Any) -> Any:
 
 
 def _op(name: str, function: Any, examples: Any) -> Op:
-    if not callable(function):
-        raise InputError(f"function '{name}': expected a function of tensors, found {type(function).__name__}")
+    if not callable(function) or isinstance(function, type):
+        found = "a class; name an object of it" if isinstance(function, type) else type(function).__name__
+        raise InputError(f"function '{name}': expected a function of tensors, found {found}")
     if examples is None:
         return _on_images(name, function)
     given = examples if isinstance(examples, Mapping) else {"example": examples}
@@ -229,8 +230,9 @@ def _copy(tensor: Tensor) -> Tensor:
 
 
 def _parameters(function: Any) -> list[inspect.Parameter]:
-    """The positional parameters of a function."""
+    """The positional parameters of a function, or of the forward of a Module."""
     try:
+        function = function.forward if isinstance(function, torch.nn.Module) else function
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):  # functions of torch written in C++ have no signature
         return []

@@ -148,6 +148,7 @@ def test_cancellation_fails_in_the_case_where_it_occurs(mine: Path, tmp_path: Pa
     [
         ("absent", "expected a function 'absent' in {path}, found "),
         ("number", "expected a function of tensors, found int"),
+        ("Square", "expected a function of tensors, found a class"),
         ("counts", "expected one or several floating-point tensors of it, found torch.int64"),
         ("fails", "it fails in float64: RuntimeError: no luck today"),
         ("integers", "expected a floating-point tensor as example input 1, found torch.int64 of (3,)"),
@@ -167,7 +168,8 @@ def test_images_are_drawn_for_a_function_without_example_inputs(tmp_path: Path) 
     mine.write_text(
         "def power(image, other, exponent=2):\n    return image**exponent + other\n\n"
         "def norm(image):\n    return image.square().sum(1).sqrt()\n\n"
-        "def mean(image):\n    return (image**2).mean((2, 3)).clamp_min(1e-6).sqrt()\n"
+        "def mean(image):\n    return (image**2).mean((2, 3)).clamp_min(1e-6).sqrt()\n\n"
+        "import torch\nmodule = torch.nn.AvgPool2d(2)\n"
     )
 
     def failed(name: str, dtype: str) -> set[tuple[str, str]]:
@@ -178,6 +180,7 @@ def test_images_are_drawn_for_a_function_without_example_inputs(tmp_path: Path) 
 
     assert run("gradcheck", f"{mine}:power", "--json", path)[0] == 0
     assert [result["inputs"] for result in json.loads(path.read_text())] == [["image", "other"]]
+    assert run("gradcheck", f"{mine}:module", "--json", path)[0] == 0
     assert failed("power", "float32") == set()
     # The derivative of a root at 0 is infinite or NaN, and a square leaves the range: those of 1e30 and 1e-30 that of
     # float32, and that of 300 the one of half precision.
