@@ -92,7 +92,8 @@ def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
     try:
         manifest = msgspec.convert(tomllib.loads(read_text(path)), _Manifest)
         if bool(manifest.shot) is bool(manifest.shots):
-            raise ValueError("both or none of them")
+            misplaced = "shots" in manifest.every
+            raise ValueError("'shots' in [every]; write it above" if misplaced else "both or none of them")
     except OSError as error:
         raise InputError(f"{path}: expected a manifest of a film, found: {error.strerror}; check the path") from error
     # An integer of too many digits is a ValueError, as are all others.

@@ -89,6 +89,7 @@ SHOT = '[[shot]]\nname = "a"\ninput = "b"\n'
         ("[[shot]\n", "found: "),
         (SHOT + "[shotz]\n", "shotz"),
         (SHOT.replace("[[shot]]", "shots = '*'\n[[shot]]"), "both or none"),
+        ("[every]\nshots = '*'\n", "'shots' in [every]"),
         ("every = 1\n" + SHOT, "$.every"),
         ('[[shot]]\ninput = "b"', "shot 1: expected 'name'"),
         ('[[shot]]\nname = "a"', "shot 1: expected 'name', a text, and 'input'"),
