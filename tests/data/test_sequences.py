@@ -256,3 +256,13 @@ def test_written_frame_is_read_back(small_sequence: Path, tmp_path: Path) -> Non
     for name, value in frame.items():
         if name != "view_projection":
             torch.testing.assert_close(getattr(found, name), value, rtol=0, atol=0, msg=name)
+
+
+def test_motion_of_three_channels_is_that_of_the_first_two(small_sequence: Path) -> None:
+    inputs = small_sequence / "inputs"
+    (inputs / "camera_matrices.h").unlink()
+    for number in range(4):
+        write_exr(inputs / f"motion{number}.exr", np.tile(np.float32([0.25, 0, 7]), (20, 24, 1)), RGB)
+    motion = open_sequence(small_sequence).frame(1).motion
+    assert motion.shape == (1, 2, 20, 24)
+    assert motion.abs().amax(dim=(0, 2, 3)).tolist() == [0.25, 0]

@@ -29,7 +29,6 @@ from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.motion import USUAL_MOTION
 from mcdenoise.reading import read_text
 
 # File names of the buffers in writing order: color is last, so that a frame that has its color is complete.
@@ -109,7 +108,7 @@ class _BmfrFolder(RenderedFiles):
         if "position" in images:
             # Where nothing was hit it may be infinite; the depth tells.
             images["position"] = np.where(np.isfinite(images["position"]), images["position"], 0)
-        if "motion" in images and self.motion != USUAL_MOTION:
+        if "motion" in images:
             images["motion"] = self.motion.apply(images["motion"])
         if normal is not None and self.encoded_normals:
             images["normal"] = np.where((normal != 0).any(-1, keepdims=True), 2 * normal - 1, 0)
