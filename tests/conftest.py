@@ -85,9 +85,7 @@ def write_small_sequence(folder: Path) -> Path:
     for number, (eye, axes, focal, _) in enumerate(cameras):
         write_bmfr_frame(inputs, number, _render(eye, axes, focal, seed=number))
     matrices = np.stack([matrix for *_, matrix in cameras])
-    write_camera_matrices(
-        inputs / "camera_matrices.h", CameraMatrices(matrices, np.full((FRAMES, 2), 0.5), 0.01, 0.25), "plane"
-    )
+    write_camera_matrices(inputs / "camera_matrices.h", CameraMatrices(matrices, np.full((FRAMES, 2), 0.5)), "plane")
     return inputs.parent
 
 

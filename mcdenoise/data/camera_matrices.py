@@ -28,20 +28,16 @@ _INITIALISER = re.compile(rf"(?:\s++|[{{}},]|{_NUMBER.pattern})*+")
 
 @dataclass(frozen=True)
 class CameraMatrices:
-    """The cameras of N frames and the limits of BMFR's temporal accumulation.
+    """The cameras of N frames.
 
     Args:
         matrices: float64 ``(N, 4, 4)`` row-vector world-to-clip matrices, ``clip = [x y z 1] @ M``, clip y down.
         pixel_offsets: float64 ``(N, 2)``, ``(ox, oy)`` in pixels: a point at (u, v) lies at pixel index
             ``(u W - ox, v H - (1 - oy))``. (0.5, 0.5) puts integers at pixel centres.
-        position_limit_squared: squared distance, in scene units, beyond which two points are not the same surface.
-        normal_limit_squared: the same for unit normals.
     """
 
     matrices: Array
     pixel_offsets: Array
-    position_limit_squared: float
-    normal_limit_squared: float
 
     def __len__(self) -> int:
         return len(self.matrices)
@@ -74,8 +70,8 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     """Read a ``camera_matrices.h``.
 
     Args:
-        path: the C header with ``camera_matrices[N][4][4]``, ``pixel_offsets[N][2]``, ``position_limit_squared`` and
-            ``normal_limit_squared``. Comments and the suffix ``f`` are accepted; expressions are not.
+        path: the C header with ``camera_matrices[N][4][4]`` and ``pixel_offsets[N][2]``. Comments and the suffix ``f``
+            are accepted; expressions are not. Other variables are not read.
 
     Raises:
         InputError: the file is missing, too large, incomplete, or contains something other than finite numbers.
@@ -86,12 +82,7 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
     text = _COMMENT.sub(" ", text)
     matrices = _read_variable(path, text, "camera_matrices", (-1, 4, 4))
-    return CameraMatrices(
-        matrices,
-        _read_variable(path, text, "pixel_offsets", (len(matrices), 2)),
-        float(_read_variable(path, text, "position_limit_squared", ())),
-        float(_read_variable(path, text, "normal_limit_squared", ())),
-    )
+    return CameraMatrices(matrices, _read_variable(path, text, "pixel_offsets", (len(matrices), 2)))
 
 
 def find_camera_matrices(folder: Path, last: int) -> CameraMatrices | None:
@@ -116,13 +107,15 @@ def find_camera_matrices(folder: Path, last: int) -> CameraMatrices | None:
     return cameras
 
 
-def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = "") -> None:
+def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = "", **limits: float) -> None:
     """Write a ``camera_matrices.h`` atomically, in single precision.
 
     Args:
         path: the file. Its folder must exist.
         cameras: the cameras to write.
         comment: one line for the beginning of the file.
+        limits: further numbers in it: the published code of BMFR needs ``position_limit_squared``, beyond which two
+            points are not the same surface, in scene units, and ``normal_limit_squared``, the same for unit normals.
 
     Raises:
         InputError: the file cannot be written.
@@ -130,8 +123,7 @@ def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = ""
     count = len(cameras)
     lines = [f"// {comment}"] if comment else []
     lines += [
-        f"const float position_limit_squared = {_literal(cameras.position_limit_squared)};",
-        f"const float normal_limit_squared = {_literal(cameras.normal_limit_squared)};",
+        *(f"const float {name} = {_literal(value)};" for name, value in limits.items()),
         f"const float camera_matrices[{count}][4][4] = {_literal(cameras.matrices.tolist())};",
         f"const float pixel_offsets[{count}][2] = {_literal(cameras.pixel_offsets.tolist())};",
     ]
@@ -139,7 +131,7 @@ def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = ""
 
 
 def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> Array:
-    expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape) if shape else "a number"
+    expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape)
     word = re.compile(rf"\b{name}\b")
     # A statement ends with a semicolon. Each statement is examined once, however often it contains the name.
     statements = (statement.partition("=") for statement in text.split(";")[:-1])

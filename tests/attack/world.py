@@ -141,7 +141,7 @@ def rendered() -> tuple[list[Frame], CameraMatrices]:
             reference=tensor(reference),
         )
         frames.append(frame)
-    return frames, CameraMatrices(np.stack(matrices), np.full((FRAMES, 2), 0.5), 0.01, 0.25)
+    return frames, CameraMatrices(np.stack(matrices), np.full((FRAMES, 2), 0.5))
 
 
 def tensor(values: np.ndarray) -> Tensor:

@@ -54,7 +54,7 @@ def test_pixel_offsets_are_folded_into_the_matrix(small_sequence: Path, offset_x
     path = small_sequence / "inputs" / "camera_matrices.h"
     cameras = read_camera_matrices(path)
     position = open_sequence(small_sequence).frame(1).position[0]
-    shifted = CameraMatrices(cameras.matrices, np.tile([offset_x, offset_y], (4, 1)), 0.01, 0.25)
+    shifted = CameraMatrices(cameras.matrices, np.tile([offset_x, offset_y], (4, 1)))
     write_camera_matrices(path, shifted)
     # The format says: pixel index = (u W - ox, v H - (1 - oy)), with the matrix as it stands in the file.
     plain = pixel_index(position, torch.from_numpy(cameras.matrices[1]))
@@ -142,7 +142,7 @@ def _rewrite(path: Path, change: Callable[[np.ndarray], np.ndarray], channels: l
 
 def _no_matrix_for_the_last_frame(inputs: Path) -> None:
     cameras = read_camera_matrices(inputs / "camera_matrices.h")
-    fewer = CameraMatrices(cameras.matrices[:3], cameras.pixel_offsets[:3], 0.01, 0.25)
+    fewer = CameraMatrices(cameras.matrices[:3], cameras.pixel_offsets[:3])
     write_camera_matrices(inputs / "camera_matrices.h", fewer)
 
 
@@ -219,7 +219,10 @@ def test_camera_header_is_read_as_c(tmp_path: Path) -> None:
     assert cameras.matrices.dtype == np.float64
     assert cameras.matrices.tolist() == [expected]
     assert cameras.pixel_offsets.tolist() == [[0.5, 0.25]]
-    assert (cameras.position_limit_squared, cameras.normal_limit_squared) == (0.0016, 0.25)
+    # What only others read is written, and need not be there.
+    write_camera_matrices(path, cameras, position_limit_squared=0.0016)
+    assert "const float position_limit_squared = 0.0016f;" in path.read_text()
+    assert read_camera_matrices(path).pixel_offsets.tolist() == [[0.5, 0.25]]
 
 
 @pytest.mark.parametrize(
@@ -229,10 +232,10 @@ def test_camera_header_is_read_as_c(tmp_path: Path) -> None:
         ("1.2f", "1e39f"),
         ("1.2f", "sqrt(2)"),
         ("1.2f, ", ""),
-        ("0.0016f", "FLT_MAX"),
+        ("0.5f", "FLT_MAX"),
         ("{{0.5f, /* y */ 0.25f}}", "{{0.5f, 0.25f}, {0.5f, 0.25f}}"),
         ("{{0.5f, /* y */ 0.25f}}", "{" * 100_000 + "}" * 100_000),
-        ("normal_limit_squared", "normal_limit"),
+        ("pixel_offsets", "pixel_offset"),
         ("/* y */", "/* y"),
         ("};\n", ""),
     ],

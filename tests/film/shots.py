@@ -49,7 +49,7 @@ def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, 
     matrices = np.concatenate([wall["view_projection"].double().numpy() for wall in walls])
     for number in range(frames):
         write_bmfr_frame(inputs, number, frame(number, width, height, seed))
-    cameras = CameraMatrices(matrices, np.full((frames, 2), 0.5), 0.01, 0.25)
+    cameras = CameraMatrices(matrices, np.full((frames, 2), 0.5))
     write_camera_matrices(inputs / "camera_matrices.h", cameras, "wall")
     return folder
 

@@ -35,10 +35,8 @@ _ALWAYS: dict[str, Any] = {
     },
 }
 BY_MITSUBA: dict[str, Any] = {
-    "noisy_seed": "numpy.random.SeedSequence((seed, frame, 0, pass)).generate_state(1)",
-    "further_noisy_seeds": "numpy.random.SeedSequence((seed, frame, 1 + k, pass)).generate_state(1), for the colors in "
-    "noise_seed{k}, k = 1, 2, ...",
-    "reference_seed": "numpy.random.SeedSequence((seed, frame, 1, pass)).generate_state(1)",
+    "seeds": "numpy.random.SeedSequence((seed, frame, stream, pass, first row)).generate_state(1); stream 0 for the "
+    "first noisy color, 1 for the reference, 1 + noise seed for the others; rows are traced in strips",
     "reference_noise_meaning": "estimated mean(|R - T| / (R + T + 0.01)) of the reference R against the truth T, from "
     "the difference of two halves of its paths",
     "pixel_sampling": "colour, features and reference all at the pixel centre (no jitter, box filter)",
@@ -148,13 +146,10 @@ class SequenceFolder:
         self._settings = {**_merged(before, described), **_ALWAYS, **conventions}
         self.references = self._find_references()
         self._write()
-        header = CameraMatrices(
-            np.array(self._settings["camera_matrices"]),
-            np.array(self._settings["pixel_offsets"]),
-            self._settings["position_limit_squared"],
-            self._settings["normal_limit_squared"],
-        )
-        write_camera_matrices(self.path / "camera_matrices.h", header, _ALWAYS["conventions"]["camera_matrices"])
+        header = CameraMatrices(*(np.array(self._settings[name]) for name in ("camera_matrices", "pixel_offsets")))
+        limits = {name: self._settings[name] for name in ("position_limit_squared", "normal_limit_squared")}
+        path = self.path / "camera_matrices.h"
+        write_camera_matrices(path, header, _ALWAYS["conventions"]["camera_matrices"], **limits)
 
     def note_reference(self, number: int, state: ReferenceState | None) -> None:
         """Record the progress of a reference, if there is any, in ``camera.json``.
