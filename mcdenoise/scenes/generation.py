@@ -31,19 +31,7 @@ class SequencePlan(Plan):
     parts: bool = False
 
     def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
-        """Render the sequence of a number.
-
-        Args:
-            number: of the place, and seed of the noise.
-            progress: called with the finished and the total number of samples per pixel.
-
-        Returns:
-            The folder of its files.
-
-        Raises:
-            InputError: see :func:`mcdenoise.scenes.render.render_sequence` and
-                :func:`mcdenoise.scenes.cycles.render_cycles`; or Blender is missing.
-        """
+        """Render the sequence of a number."""
         out = self.out / f"random{number:04d}"
         rendering = self.rendering
         width, height = (max(side, 1) for side in rendering["size"])

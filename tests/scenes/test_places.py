@@ -18,7 +18,6 @@ from mcdenoise.scenes.random.builder import SceneBuilder, bounds
 from mcdenoise.scenes.random.cameras import shoot
 from mcdenoise.scenes.render.features import SequenceTracer
 from mcdenoise.scenes.render.loading import scene_digest
-from mcdenoise.scenes.render.stage import Stage
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 SEEDS = range(24)
@@ -144,7 +143,7 @@ def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
     for seed in range(3):
         made = drawn(seed)
-        tracer = SequenceTracer(Stage(made.scene, "scalar_rgb", made.moves), made.cameras, (8, 8), None, 8)
+        tracer = SequenceTracer(made.scene, "scalar_rgb", made.moves, made.cameras, (8, 8), None, 8)
         tracer.place(FRAMES - 1)
         found = tracer.features(FRAMES - 1)
         distance = np.linalg.norm(found["position"] - made.cameras[-1].to_world[:3, 3], axis=1)

@@ -17,15 +17,8 @@ from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
 
-# Lower and upper corner of each shape in its own space.
-_BOUNDS = {
-    "cube": ((-1, -1, -1), (1, 1, 1)),
-    "sphere": ((-1, -1, -1), (1, 1, 1)),
-    "cylinder": ((-1, -1, 0), (1, 1, 1)),
-    "disk": ((-1, -1, 0), (1, 1, 0)),
-    "rectangle": ((-1, -1, 0), (1, 1, 0)),
-    "mesh": ((-1, -1, -1), (1, 1, 1)),
-}
+# Least and largest z of a shape in its own space, where they are not -1 and 1, as those of x and y are.
+_BOUNDS = {"cylinder": (0, 1), "disk": (0, 0), "rectangle": (0, 0)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +145,7 @@ def rgb(color: Color) -> dict[str, Any]:
 
 def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
     """Lower and upper corner of a transformed shape's axis-aligned bounding box."""
-    corners = np.array([*product(*zip(*_BOUNDS[kind], strict=True))], dtype=np.float64)
+    corners = np.array([*product((-1, 1), (-1, 1), _BOUNDS.get(kind, (-1, 1)))], dtype=np.float64)
     world = corners @ matrix[:3, :3].T + matrix[:3, 3]
     return world.min(axis=0), world.max(axis=0)
 

@@ -146,11 +146,7 @@ def add_spot(
     cutoff = float(rng.uniform(15, 55))
     solid = 2 * math.pi * (1 - math.cos(math.radians(cutoff)))
     intensity = _scaled(color, power / solid * 0.5)
-    axis = (target - origin) / np.linalg.norm(target - origin)
-    side = np.cross((0.0, 0.0, 1.0), axis)
-    side /= np.linalg.norm(side)
-    pose = np.eye(4)
-    pose[:3] = np.stack((side, np.cross(axis, side), axis, origin), axis=1)
+    pose = _facing(origin, target, (0.0, 0.0, 1.0))
     builder.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
 
 
@@ -161,14 +157,19 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     if rng.random() < 0.4:
         builder.add([ball(origin, size / 2, black, _scaled(color, power / (math.pi**2 * size**2)))])
         return
-    axis = (target - origin) / np.linalg.norm(target - origin)
-    side = np.cross((0.0, 1.0, 0.0), axis)
-    side /= max(float(np.linalg.norm(side)), 1e-6)
-    rotation = np.eye(4)
-    rotation[:3, :3] = np.stack((side, np.cross(axis, side), axis), axis=1)
     half_size = (size, size * float(rng.uniform(0.3, 1)))
     radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
-    builder.add([sheet(origin, half_size, black, rotation, radiance)])
+    builder.add([sheet(origin, half_size, black, _facing(origin, target, (0.0, 1.0, 0.0)), radiance)])
+
+
+def _facing(origin: Array, target: Array, up: Point) -> Array:
+    """A pose at a place whose +z points to a target."""
+    axis = (target - origin) / np.linalg.norm(target - origin)
+    side = np.cross(up, axis)
+    side /= max(float(np.linalg.norm(side)), 1e-6)
+    pose = np.eye(4)
+    pose[:3] = np.stack((side, np.cross(axis, side), axis, origin), axis=1)
+    return pose
 
 
 def _glowing(

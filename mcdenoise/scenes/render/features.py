@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.render.film import Film
+from mcdenoise.scenes.render.loading import Scene
 from mcdenoise.scenes.render.stage import Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, NORMAL, REST, WAVEFRONT, Samples, Tracer
 
@@ -21,7 +22,9 @@ class SequenceTracer(Tracer):
     """The scene of a sequence.
 
     Args:
-        stage: the scene.
+        scene: see :func:`mcdenoise.scenes.render.render_sequence`.
+        variant: a variant of Mitsuba.
+        moves: see :class:`mcdenoise.data.camera_path.CameraPath`.
         cameras: one a frame.
         size: width and height in pixels.
         film: filter and lens; without one all samples are at the pixel centre.
@@ -32,12 +35,15 @@ class SequenceTracer(Tracer):
 
     def __init__(
         self,
-        stage: Stage,
+        scene: Scene,
+        variant: str,
+        moves: Mapping[str, Array],
         cameras: Sequence[Camera],
         size: tuple[int, int],
         film: Film | None,
         max_depth: int,
     ) -> None:
+        stage = Stage(scene, variant, moves)
         mi = stage.mitsuba
         bsdfs = [shape.bsdf() for shape in stage.scene.shapes()]
         # An instance has none of its own.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mcdenoise.data.camera_path import Array, Camera
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
 from mcdenoise.data.readers.files import as_tensor
@@ -20,8 +20,6 @@ from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import ReferenceState, write_noisy, write_reference
 from mcdenoise.scenes.render.halves import ReferenceHalves
-from mcdenoise.scenes.render.loading import Scene
-from mcdenoise.scenes.render.stage import Stage
 
 # With fewer paths, rare bright ones have not been hit yet, and the noise is underestimated.
 _FEWEST_PATHS_IN_A_HALF = 16
@@ -38,20 +36,17 @@ class FrameJob:
     """Settings common to all frames, those of :func:`mcdenoise.scenes.render.render_sequence`, and the state on disk.
 
     Args:
-        cameras: also of frames that are not rendered.
+        load: makes the tracer of the scene.
         folder: ``inputs`` of the sequence.
         frames: how many are rendered.
         references: frames that get a reference.
         started: progress of the references on disk.
     """
 
-    scene: Scene
-    variant: str
+    load: Callable[[], SequenceTracer]
     moves: dict[str, Array]
-    cameras: list[Camera]
     size: tuple[int, int]
     film: Film | None
-    max_depth: int
     folder: Path
     frames: int
     spp: int
@@ -109,8 +104,7 @@ def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:
     """A task: :func:`render_frame` by the scene that this worker has loaded, if it is the same."""
     if job.folder not in _loaded:
         _loaded.clear()
-        stage = Stage(job.scene, job.variant, job.moves)
-        _loaded[job.folder] = SequenceTracer(stage, job.cameras, job.size, job.film, job.max_depth)
+        _loaded[job.folder] = job.load()
     return render_frame(job, _loaded[job.folder], number, lambda paths: None)
 
 

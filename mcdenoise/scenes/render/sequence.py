@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -22,7 +23,6 @@ from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame, render_frame_task
 from mcdenoise.scenes.render.loading import Scene, choose_variant
-from mcdenoise.scenes.render.stage import Stage
 
 _LARGEST_SIDE = 16384
 
@@ -114,7 +114,8 @@ def render_sequence(
             raise InputError(
                 f"scene dictionary: expected plain Python and numpy for more than one worker, found {error}"
             ) from error
-    tracer = SequenceTracer(Stage(scene, variant, checked_moves), cameras, size, film, max_depth)
+    load = partial(SequenceTracer, scene, variant, checked_moves, cameras, size, film, max_depth)
+    tracer = load()
     tracer.place(0)
     away = tracer.features(0)["position"] - cameras[0].to_world[:3, 3]
     scale = float(np.median(np.linalg.norm(away, axis=1)))
@@ -140,13 +141,10 @@ def render_sequence(
         position_limit_squared=(0.02 * scale) ** 2,
     )
     job = FrameJob(
-        scene=scene,
-        variant=variant,
+        load=load,
         moves=checked_moves,
-        cameras=cameras,
         size=size,
         film=film,
-        max_depth=max_depth,
         folder=folder.path,
         frames=count,
         spp=spp,

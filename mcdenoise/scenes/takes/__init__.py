@@ -64,7 +64,18 @@ class Plan:
         return tracer, final
 
     def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
-        """Render what a number is, and return its file or folder; progress gets finished and all samples a pixel."""
+        """Render what a number is, as far as it is not there yet.
+
+        Args:
+            number: 0 or more: of the place, and seed of the noise.
+            progress: called with the finished and the total number of samples a pixel; not for a take.
+
+        Returns:
+            Its file or folder.
+
+        Raises:
+            InputError: Mitsuba or Blender is missing or fails, or the folder cannot be written or holds something else.
+        """
         raise NotImplementedError
 
 
@@ -92,18 +103,7 @@ class TakePlan(Plan):
         return {"takes": 1, **own, **({"plain": True} if self.plain else {}), "reference_spp": 2 * self.half}
 
     def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
-        """Render the take of a number, if it is not there yet.
-
-        Args:
-            number: of the take.
-            progress: not called: a take is short.
-
-        Returns:
-            Its file.
-
-        Raises:
-            InputError: Mitsuba is missing, or the folder cannot be written or holds takes of another plan.
-        """
+        """Render the take of a number."""
         _claim(self)
         path = self.out / f"{number:06d}{SUFFIX}"
         if not path.exists():
