@@ -88,7 +88,7 @@ class _Translator:
             if not isinstance(entry, Mapping):
                 continue
             if entry["type"] in ("point", "spot"):
-                lights += _light(entry)
+                lights.append(_light(entry))
             elif entry["type"] == "envmap":
                 self._arrays["sky"] = np.ascontiguousarray(entry["bitmap"], dtype=np.float32)
                 sky = {"texture": "sky"}
@@ -183,14 +183,11 @@ class _Translator:
         return {"texture": name, "scale": np.diagonal(value["to_uv"])[:2].tolist()}
 
 
-def _light(light: Mapping[str, Any]) -> list[dict[str, Any]]:
-    intensity = _rgb(light["intensity"])
-    if not any(intensity):
-        return []
+def _light(light: Mapping[str, Any]) -> dict[str, Any]:
+    found = {"type": light["type"], "intensity": _rgb(light["intensity"])}
     if light["type"] == "point":
-        return [{"type": "point", "position": list(light["position"]), "intensity": intensity}]
-    to_world = np.asarray(light["to_world"]).tolist()
-    return [{"type": "spot", "to_world": to_world, "intensity": intensity, "cutoff": light["cutoff_angle"]}]
+        return found | {"position": list(light["position"])}
+    return found | {"to_world": np.asarray(light["to_world"]).tolist(), "cutoff": light["cutoff_angle"]}
 
 
 def _rgb(value: Any) -> list[float]:

@@ -109,7 +109,8 @@ def draw_take(
     cameras = shoot(builder, camera_rng, count)
     # Half of them show a whole place; the others have the pixels of a larger image, with wide plain surfaces.
     zoom = math.exp(max(0.0, rng.uniform(-1, 1)) * math.log(_LARGEST_ZOOM))
-    cameras = [replace(camera, fov_x=_narrowed(camera.fov_x, zoom)) for camera in cameras]
+    fov = math.degrees(2 * math.atan(math.tan(math.radians(cameras[0].fov_x) / 2) / zoom))
+    cameras = [replace(camera, fov_x=fov) for camera in cameras]
     moves: dict[str, Array] = {}
     if not still and move_rng.random() < _MOVING:
         moves = movements(builder, move_rng, count, cameras[0])
@@ -121,7 +122,7 @@ def draw_take(
     kind = _draw(rng, _FILTERS)
     focus = max(distance(builder, cameras[0]), 0.05)
     blur = math.exp(rng.uniform(*np.log(_BLUR)))
-    pixel = 2 * focus * math.tan(math.radians(cameras[0].fov_x) / 2) / size[0]
+    pixel = 2 * focus * math.tan(math.radians(fov) / 2) / size[0]
     lens, splat = rng.random() < _LENS, rng.random() < _SPLAT
     take = Take(
         number=number,
@@ -147,10 +148,6 @@ def draw_take(
     if not plain:
         return take
     return replace(take, spp=1, features="exact", film=Film("centre", focus=focus, splat=False))
-
-
-def _narrowed(fov: float, zoom: float) -> float:
-    return math.degrees(2 * math.atan(math.tan(math.radians(fov) / 2) / zoom))
 
 
 def _draw(rng: np.random.Generator, weights: Mapping[_Value, float]) -> _Value:

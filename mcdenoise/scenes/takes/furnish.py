@@ -23,7 +23,7 @@ from mcdenoise.scenes.random.textures import Rng
 _ENOUGH = 500_000
 _SMALL, _LEAST = 0.5, 0.03
 _INDOORS = ("Living room", "Bedroom", "Kitchen", "Bathroom", "Office")
-_OUTDOORS = ("Exterior", "Vehicles", "Characters", "Exterior")
+_OUTDOORS = ("Exterior", "Vehicles", "Characters")
 
 
 @dataclass
@@ -71,11 +71,6 @@ class Stock:
         path = paths[int(rng.integers(len(paths)))]
         self.credits.add(self.assets.credit(path))
         return path
-
-
-def theme(rng: Rng) -> str:
-    """The kind of a room."""
-    return _INDOORS[int(rng.integers(len(_INDOORS)))]
 
 
 def add_model(
@@ -192,7 +187,7 @@ def fill_room(builder: SceneBuilder, rng: Rng, stock: Stock, brightness: float) 
         furnish(builder, rng)
         return
     room = builder.high - builder.low
-    kind = theme(rng)
+    kind = _INDOORS[int(rng.integers(len(_INDOORS)))]
     pieces, hung = stock.pieces(kind, room * (0.75, 0.95, 0.75)), stock.hung(kind)
     floor = Floor(builder.low, builder.high)
     for _ in range(int(np.clip(room[0] * room[2] / rng.uniform(1.3, 3), 4, 16))):

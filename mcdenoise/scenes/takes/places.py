@@ -28,6 +28,8 @@ from mcdenoise.scenes.takes.furnish import Floor, Stock, add_model, bumpy, fill_
 _BUMPY, _FINE, _SHINY = 0.2, 0.12, 0.35
 # Fraction of day rooms whose windows are lights themselves, which takes fewer samples than a sky behind them.
 _GLOWING = 0.5
+# Turns a sheet to face upwards.
+_UPWARDS = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 
 def build(rng: Rng, stock: Stock, pick: float) -> tuple[SceneBuilder, bool]:
@@ -246,14 +248,9 @@ def _display(rng: Rng, stock: Stock) -> SceneBuilder:
         add_model(builder, rng, stock, model, frame, scale=size / max(model.size), movable=True)
     if rng.random() < 0.3:
         base = builder.material(random_opaque(rng, textured=0.5))
-        builder.add([sheet((0, -0.31, 0), (0.8, 0.8), base, _flat())])
+        builder.add([sheet((0, -0.31, 0), (0.8, 0.8), base, _UPWARDS)])
     if rng.random() < 0.7:
         builder.set_sky(any_sky(rng, stock, 0.7, sun_direction(rng), float(np.exp(rng.uniform(-0.7, 1.8)))))
     else:
         builder.set_sky(studio(rng, 0.5))
     return builder
-
-
-def _flat() -> Array:
-    """Turns a sheet to face upwards."""
-    return np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64)
