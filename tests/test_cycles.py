@@ -7,6 +7,7 @@ import importlib.util
 import json
 import math
 import os
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -255,6 +256,17 @@ def test_a_python_without_blender_is_told_in_one_line(tmp_path: Path, monkeypatc
     with pytest.raises(InputError, match="nothing that runs"):
         Blender(tmp_path / "python")
     assert not any(tmp_path.iterdir())
+
+
+def test_a_blender_that_has_died_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bpy.py").write_text("class app: version_string = 'none'")
+    (tmp_path / "mathutils.py").write_text("Matrix = None")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with Blender(Path(sys.executable)) as running:
+        running._process.kill()
+        running._process.wait()
+        with pytest.raises(InputError, match="'render': it ended"):
+            running.ask("render")
 
 
 @pytest.fixture(scope="module")
