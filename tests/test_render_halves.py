@@ -24,7 +24,7 @@ def passes(count: int, paths: int, seed: int = 0) -> list[np.ndarray]:
 def test_noise_is_the_smape_against_the_truth(start: int) -> None:
     """This holds with equal halves, and where one half is all that there was before."""
     before = passes(1, start, seed=1)[0] if start else np.zeros((PIXELS, 3))
-    halves = ReferenceHalves.start(before, start, start)
+    halves = ReferenceHalves(before, start, start)
     for mean in passes(6, 16):
         halves.add(mean, 16)
     truth = np.linspace(0.1, 4, PIXELS * 3).reshape(PIXELS, 3)
@@ -36,7 +36,7 @@ def test_noise_is_the_smape_against_the_truth(start: int) -> None:
 
 
 def test_saved_and_loaded(tmp_path: Path) -> None:
-    halves = ReferenceHalves.start(np.zeros((PIXELS, 3)), 0, 0)
+    halves = ReferenceHalves(np.zeros((PIXELS, 3)))
     for mean in passes(3, 16):
         halves.add(mean, 16)
     path = tmp_path / "reference0.partial.npz"

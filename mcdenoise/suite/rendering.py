@@ -194,7 +194,7 @@ def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
         color = pixels[..., chosen].astype(np.float64)
         if halves is None:
             size = color.shape[:2]
-            halves = ReferenceHalves.start(np.zeros((size[0] * size[1], 3)), 0, 0)
+            halves = ReferenceHalves(np.zeros((size[0] * size[1], 3)))
         halves.add(color.reshape(-1, 3), samples)
     assert halves is not None, "there are at least two parts"
     write_exr(path, halves.mean().astype(np.float32).reshape(*size, 3), ["R", "G", "B"])

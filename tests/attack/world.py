@@ -100,7 +100,7 @@ def build(folder: Path) -> None:
     (folder / "precision.json").write_text(json.dumps({"a machine": 1.5}))
     (folder / "clean").mkdir()
     write_clean_features(folder / "clean", 0, *(tensor(np.ones((WIDTH * HEIGHT, 3))),) * 2)
-    halves = ReferenceHalves.start(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
+    halves = ReferenceHalves(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
     halves.add(np.full((WIDTH * HEIGHT, 3), 1.5), 4)
     halves.save(folder / "reference0.partial.npz")
     colors = np.stack([frame.color[0].numpy() for frame in frames])

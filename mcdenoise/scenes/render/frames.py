@@ -180,7 +180,7 @@ def _refine_reference(
         mean = np.zeros((job.size[0] * job.size[1], 3))
         if before.spp:
             mean += read_exr(job.folder / f"reference{number}.exr")[0].reshape(mean.shape)
-        halves = ReferenceHalves.start(mean, before.spp, before.passes)
+        halves = ReferenceHalves(mean, before.spp, before.passes)
     saved = time.monotonic()
     while not job.is_good(halves.spp, _reliable_noise(halves)):
         missing = job.reference_spp - halves.spp

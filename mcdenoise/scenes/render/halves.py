@@ -32,20 +32,15 @@ class ReferenceHalves:
     too low from 128 paths on, and 15 % too low at 32.
 
     Args:
-        sums: ``(2, N, 3)`` summed radiance of each half.
-        paths: paths per pixel of each half.
+        mean: ``(N, 3)`` mean of the paths that are there, which become the first half.
+        spp: number of these paths per pixel.
         passes: number of passes so far, which is also the seed number of the next pass.
     """
 
-    def __init__(self, sums: Array, paths: tuple[int, int], passes: int) -> None:
-        self._sums = sums
-        self.paths = paths
-        self.passes = passes
-
-    @classmethod
-    def start(cls, mean: Array, spp: int, passes: int) -> ReferenceHalves:
-        """Start from an existing ``(N, 3)`` mean of ``spp`` paths (possibly 0), which becomes the first half."""
-        return cls(np.stack([mean * spp, np.zeros_like(mean)]), (spp, 0), passes)
+    def __init__(self, mean: Array, spp: int = 0, passes: int = 0) -> None:
+        self._sums = np.stack([mean * spp, np.zeros_like(mean)])
+        # Paths per pixel of each half.
+        self.paths, self.passes = (spp, 0), passes
 
     @classmethod
     def load(cls, path: Path, size: tuple[int, int]) -> ReferenceHalves:
@@ -67,7 +62,9 @@ class ReferenceHalves:
                 raise ValueError("other counts, or pixels of another image")
         except Exception as error:  # of zipfile, zlib, numpy, and of Python's tokenizer, which reads numpy's headers
             raise InputError(f"{path}: expected an unfinished reference, found something else; remove it") from error
-        return cls(sums, (first, second), passes)
+        halves = cls(sums[0], passes=passes)
+        halves._sums, halves.paths = sums, (first, second)
+        return halves
 
     def save(self, path: Path) -> None:
         """Write the state atomically.
