@@ -168,16 +168,8 @@ def open_result(path: Path, layer: str | None = None, color_space: ColorSpace = 
 def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers) -> set[Layer]:
     """Check that every frame has every buffer, in the same display window; join data windows that differ.
 
-    Args:
-        shot: the files.
-        splits: candidates for parts of the light.
-        samples: layers of samples.
-
     Returns:
         The layers of parts of the light and of samples that every frame has, with the data window of the color.
-
-    Raises:
-        InputError: a buffer is missing, or has other pixels than the color.
     """
     color = shot.choice.layers["color"]
     main = shot.part_of(color)

@@ -193,10 +193,6 @@ def records(content: bytes | mmap.mmap) -> Iterator[Record]:
 def _readable(source: Path, copy: Path) -> Iterator[dict[tuple[int, bytes], bytes]]:
     """Write a copy that OpenEXR's Python module can read, for as long as the block lasts.
 
-    Args:
-        source: an EXR.
-        copy: path of the copy.
-
     Yields:
         The original records by part and name of the placeholder, for :func:`_put_back`.
     """
