@@ -164,8 +164,9 @@ class Frame:
                 )
             shape: tuple[int, ...] = (batch, 4, 4)
             if name != "view_projection":
-                channels = BUFFERS[name].channels if name in BUFFERS else value.shape[-3] if value.ndim > 2 else 1
-                samples = value.shape[1:2] if name == "samples" and value.ndim > 1 else ()
+                found = value.shape[-3] if value.ndim > 2 else 1
+                channels = BUFFERS[name].channels if name in BUFFERS else max(found, 1)
+                samples = [max(count, 1) for count in value.shape[1:2]] if name == "samples" else []
                 shape = (batch, *samples, channels, height, width)
             if tuple(value.shape) != shape:
                 raise InputError(f"buffer '{name}': expected shape {shape} like 'color', found {tuple(value.shape)}")

@@ -98,6 +98,10 @@ def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
         Frame(color=plane(3), extra={"crypto": plane(5).long()})
     with pytest.raises(InputError, match="buffer 'crypto'"):
         Frame(color=plane(3), extra={"crypto": plane(5, NAN)}).validate()
+    with pytest.raises(InputError, match="buffer 'crypto'"):
+        Frame(color=plane(3), extra={"crypto": plane(5)[:, :0]})
+    with pytest.raises(InputError, match="buffer 'samples'"):
+        Frame(color=plane(3), samples=plane(3)[:, None][:, :0])
     assert Frame(color=plane(3), extra={"crypto": plane(5, -INF)}).validate()[1] == 0
 
 
