@@ -93,8 +93,9 @@ def smape_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1
 def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
     """Mean absolute difference of gamma-mapped radiance, which gives bright pixels less weight than dark ones.
 
-    ``L = mean |g(R) - g(Y)| + w_t L_t(dR, dY)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2)`` and ``c = 0.001``. Meng et
-    al. 2020 train without ``c`` and without ``L_t``. Unlike :func:`display_error` it has no upper limit.
+    ``L = mean |g(R) - g(Y)| + w_t L_t(dR, dY)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2) + min(x, 0)`` and
+    ``c = 0.001``. Meng et al. 2020 train without ``c``, negative light and ``L_t``. Unlike :func:`display_error` it has
+    no upper limit.
 
     Args:
         image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
@@ -102,15 +103,19 @@ def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float 
         temporal_weight: ``w_t`` of the temporal SMAPE; 0 disables it.
 
     Returns:
-        A scalar, the mean over the batch, differentiable where both images differ, also in black.
+        A scalar, the mean over the batch, differentiable where both images differ, also in black and below.
 
     Raises:
         ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
     """
     check_images(image, reference)
-    shown, wanted = (each.clamp_min(0).add(_DARK).pow(1 / 2.2) for each in (image, reference))
-    spatial = (shown - wanted).abs().mean()
+    spatial = (_shown(image) - _shown(reference)).abs().mean()
     return spatial + temporal_weight * temporal_smape_linear(image, reference).mean() if temporal_weight else spatial
+
+
+def _shown(image: Tensor) -> Tensor:
+    # A network without a last activation begins with negative light, which must have a derivative.
+    return image.clamp_min(0).add(_DARK).pow(1 / 2.2) + torch.where(image < 0, image, 0)
 
 
 def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:

@@ -42,7 +42,7 @@ def test_the_loss_is_equation_11() -> None:
 def test_the_loss_on_the_curve_of_a_display() -> None:
     """The loss replaces SMAPE, and the temporal loss stays as it was."""
     image, reference = (3 * torch.rand(2, 3, 3, 4, 5, dtype=torch.float64) - 0.5 for _ in range(2))
-    shown, wanted = ((each.clamp_min(0) + 1e-3) ** (1 / 2.2) for each in (image, reference))
+    shown, wanted = ((each.clamp_min(0) + 1e-3) ** (1 / 2.2) + each.clamp_max(0) for each in (image, reference))
     expected = (shown - wanted).abs().mean()
     found = stage_loss(Output(image), reference, temporal_weight=0, loss="l1_display")
     torch.testing.assert_close(found, expected)
@@ -58,6 +58,13 @@ def test_the_gradient_on_the_curve_of_a_display_is_finite_in_black() -> None:
     image = torch.zeros(1, 1, 3, 2, 2, requires_grad=True)
     stage_loss(Output(image), image.detach() + 0.1, temporal_weight=0, loss="l1_display").backward()
     assert torch.isfinite(image.grad).all()
+    assert (image.grad < 0).all()
+
+
+@pytest.mark.parametrize("loss", ["smape", "l1_display", "rae"])
+def test_every_loss_leads_out_of_negative_light(loss: Loss) -> None:
+    image = torch.full((1, 1, 3, 2, 2), -0.1).requires_grad_()
+    stage_loss(Output(image), torch.full_like(image, 0.5), temporal_weight=0, loss=loss).backward()
     assert (image.grad < 0).all()
 
 
