@@ -9,14 +9,16 @@ from torch import Tensor
 from mcdenoise.ops._check import check_least, check_shapes
 from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, bounded_quotient, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._numbers import unit_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype, corner, up_to_multiple
 
 STRATUM, LEVELS = 3, 5
 # Standard errors up to which a change is taken for noise.
 THRESHOLD = 2.0
-# Luminance that counts as black, as a fraction of the largest one of an image.
-_BLACK = 1e-15
+# Luminance that counts as black, as a fraction of the largest one of an image; and the largest variance, as a multiple
+# of the square of that one. No change is seen through so much noise, and its sums are finite.
+_BLACK, _NOISIEST = 1e-15, 1e30
 
 
 @made_of(average)
@@ -54,8 +56,8 @@ def temporal_gradient(
         current: ``(B, 1, H, W)`` luminance now, at least 0, finite: of the samples of the frame before, shaded once
             more with their random numbers; or else of this frame.
         previous: ``(B, 1, H, W)`` luminance of the same samples, or at the same places, in the frame before, likewise.
-        weight: ``(B, 1, H, W)`` at least 0, how much of a pixel is compared: 0 where there is nothing to compare it
-            with, and 1 for the one sample of a stratum that was shaded once more; by default 1 everywhere.
+        weight: ``(B, 1, H, W)`` at least 0, in any unit, how much of a pixel is compared: 0 where there is nothing to
+            compare it with, and 1 for the one sample of a stratum that was shaded once more; by default 1 everywhere.
         variance: ``(B, 1, H, W)`` of ``current - previous`` where nothing changes, 0 to 1e34; by default 0, which is
             right for samples with the same random numbers.
         normal: ``(B, 3, H, W)`` unit normals, 0 where nothing was hit; without them ``w_n = 1``.
@@ -131,17 +133,20 @@ def sums_of_strata(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``D``, ``M`` and ``V`` of :func:`temporal_gradient` after the filter, ``(B, 1, H / stratum, W / stratum)`` each.
 
-    In a unit of their own, in which the largest luminance is between 1/2 and 1, and ``M`` 0 where it counts as that.
+    In a unit of their own, in which the largest luminance and the largest weight are between 1 and 2, and ``M`` 0 where
+    it counts as that.
     """
     dtype = accumulator_dtype(current.dtype)
     now, before = current.to(dtype), previous.to(dtype)
-    # So that no square leaves the range. A power of two rounds nothing; in ONNX there is no such number.
+    # So that no square leaves the range.
     largest = torch.maximum(now.detach(), before.detach()).abs().amax((1, 2, 3), keepdim=True)
-    power = largest if torch.compiler.is_exporting() else largest / torch.frexp(largest).mantissa
-    unit = torch.where(largest > 0, power, 1)
+    unit = unit_of(largest)
     now, before = now / unit, before / unit
     compared = torch.ones_like(now) if weight is None else weight.to(dtype)
-    noise = torch.zeros_like(now) if variance is None else compared.square() * (variance.to(dtype) / unit / unit)
+    compared = compared / unit_of(compared.detach().amax((1, 2, 3), keepdim=True))
+    noise = torch.zeros_like(now)
+    if variance is not None:
+        noise = compared.square() * (variance.to(dtype) / unit / unit).clamp_max(_NOISIEST)
     change = torch.cat([compared * (now - before), compared * torch.maximum(now, before)], 1)
     # Means in place of sums, over as many pixels beyond the border as inside.
     change = F.avg_pool2d(up_to_multiple(change, stratum), stratum)

@@ -9,6 +9,7 @@ from torch import Tensor
 from mcdenoise.ops._check import check_kernel_size, check_positive, check_shapes
 from mcdenoise.ops._constants import LAG_WINDOW, SMALLEST_LAG
 from mcdenoise.ops._module import module_of
+from mcdenoise.ops._numbers import unit_of
 from mcdenoise.ops._window import accumulator_dtype
 
 THRESHOLD = 2.0
@@ -73,19 +74,18 @@ def history_lag(
     dtype = accumulator_dtype(history.dtype)
     # Squares of numbers up to 1 do not overflow. The division comes before the sums, which could.
     largest = torch.maximum(history.detach().abs(), recent.detach().abs()).to(dtype).amax((1, 2, 3), keepdim=True)
-    # A power of two, which rounds nothing; exported graphs take the number itself, as ONNX lacks mantissas.
-    power = largest if torch.compiler.is_exporting() else largest / (2 * torch.frexp(largest).mantissa)
-    largest = torch.where(largest > 0, power, 1)
-    long, short = ((image.to(dtype) / largest).mean(1, keepdim=True) for image in (history, recent))
+    unit = unit_of(largest)
+    long, short = ((image.to(dtype) / unit).mean(1, keepdim=True) for image in (history, recent))
     # Not the difference of the means, which cancels.
     mean, difference = _box(short, kernel_size), _box(short - long, kernel_size)
     height, width = history.shape[-2:]
     count = _count(height, kernel_size, mean)[:, None] * _count(width, kernel_size, mean)
-    error = _box(variance.to(dtype) / largest / largest, kernel_size) / count
+    error = _box(variance.to(dtype) / unit / unit, kernel_size) / count
     smallest = SMALLEST_LAG * ((mean - difference).abs() + mean.abs()) / 2
     noise = threshold**2 * (error + smallest.square())
     some = noise > 0
-    ratio = torch.where(some, difference.square() / torch.where(some, noise, 1), 0)
+    # Squared last: the derivative of a square over its noise overflows where both are small.
+    ratio = torch.where(some, difference / torch.sqrt(torch.where(some, noise, 1)), 0).square()
     return ((ratio - 1) / 3).clamp(0, 1).to(history.dtype)
 
 

@@ -46,3 +46,14 @@ def test_rare_bright_paths_are_no_lag() -> None:
     dark = lag(torch.ones(1, 1, *SIZE), recent, torch.zeros(1, 1, *SIZE))
     assert dark.mean() > 0.9
     assert lag(torch.ones(1, 1, *SIZE), recent, torch.full((1, 1, *SIZE), 299.0)).mean() < 0.2
+
+
+@pytest.mark.parametrize("light", [1e-14, 1e-16, 1e-19, 1e-21])
+def test_the_derivative_in_the_dark_beside_a_lamp_is_finite(light: float) -> None:
+    """Where a light goes out that is so much darker than the lamp, z is large, and so is its derivative."""
+    history, variance = torch.full((1, 1, 8, 8), light), torch.zeros(1, 1, 8, 8)
+    recent = torch.zeros_like(history)
+    history[..., 0, 0] = recent[..., 0, 0] = 1
+    images = [each.requires_grad_() for each in (history, recent, variance)]
+    slopes = torch.autograd.grad(history_lag(*images).sum(), images)
+    assert all(slope.isfinite().all() for slope in slopes)

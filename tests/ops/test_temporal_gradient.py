@@ -1,5 +1,6 @@
 """Properties of temporal gradients, beside their equation."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -38,3 +39,22 @@ def test_noise_within_two_standard_errors_is_none() -> None:
     assert 0.0 < wide < 0.15
     # A change by three parts in a hundred, in strata of 9 and then 9 of them, is seen through noise of seven.
     assert (temporal_gradient(1.1 * now, before, None, variance, levels=3) > 0.08).double().mean() > 0.95
+
+
+@pytest.mark.parametrize("unit", [2.0**-100, 2.0**127])
+def test_no_unit_is_too_dim_or_too_bright(unit: float) -> None:
+    """Of light, or of weights. The next power of two is infinite in float32."""
+    now, before = (light(seed).float() for seed in (0, 1))
+    one = torch.ones_like(now)
+    for images in ((unit * now, unit * before, one), (now, before, unit * one)):
+        assert torch.equal(temporal_gradient(*images), temporal_gradient(now, before))
+
+
+def test_a_variance_that_is_too_large_hides_the_change_where_it_is() -> None:
+    """Relative to so little light it is infinite, which is 0 times infinity on other surfaces, and in derivatives."""
+    left = (torch.arange(WIDTH) < WIDTH // 2).float().expand(1, 1, HEIGHT, WIDTH)
+    normal = torch.cat([left, torch.zeros_like(left), 1 - left], 1)
+    lit, variance = (1e-15 * light().float()).requires_grad_(), (1e34 * left).requires_grad_()
+    found = temporal_gradient(lit, torch.zeros_like(lit), None, variance, normal)
+    assert torch.equal(found, 1 - left)
+    assert all(slope.isfinite().all() for slope in torch.autograd.grad(found.sum(), (lit, variance)))
