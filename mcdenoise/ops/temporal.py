@@ -174,8 +174,10 @@ def reproject(
         # A rejected tap may be NaN, and 0 * NaN is NaN.
         values = values + bilinear * torch.where(kept, value, 0)
         weight = weight + bilinear
-    found = weight > 0
+    # The inverse of a denormal number may be infinite.
+    found = weight >= torch.finfo(dtype).tiny
     values = torch.where(found, values / torch.where(found, weight, 1), 0)
+    weight = torch.where(found, weight, 0)
     return values.to(previous.dtype), weight.to(previous.dtype)
 
 

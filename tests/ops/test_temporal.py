@@ -4,7 +4,8 @@ import torch
 from reference_cases import by
 from torch import Tensor
 
-from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject
+from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject, use
+from mcdenoise.ops._backend import BACKENDS
 
 INF, NAN = torch.inf, torch.nan
 
@@ -124,6 +125,19 @@ def test_no_motion_is_one_of_zeros_to_the_last_bit() -> None:
     slopes = [torch.autograd.grad(value.square().sum(), previous)[0] for value, _ in (results, expected)]
     assert torch.equal(*slopes)
     assert results[1].unique().tolist() == [0, 1]
+
+
+def test_a_tap_of_hardly_any_weight_is_none() -> None:
+    """Where only the lower right tap shows the surface, by a motion of 1e-20; the inverse of 1e-40 is infinite."""
+    facing = torch.tensor([[1.0, 1.0], [1.0, -1.0]]).reshape(1, 1, 2, 2)
+    normal = torch.cat([torch.zeros(1, 2, 2, 2), facing], 1)
+    previous, motion = torch.ones(1, 1, 2, 2, requires_grad=True), torch.full((1, 2, 2, 2), 1e-20, requires_grad=True)
+    surfaces = Surface(normal=-normal[..., :1, :1].expand_as(normal)), Surface(normal=normal)
+    for backend in BACKENDS:
+        with torch.no_grad(), use(backend):
+            assert reproject(previous, motion, *surfaces)[1][0, 0, 0, 0] == 0
+    value, _ = reproject(previous, motion, *surfaces)
+    assert all(slope.isfinite().all() for slope in torch.autograd.grad(value.sum(), (previous, motion)))
 
 
 def test_surfaces_of_half_precision_are_compared_alike_with_and_without_motion() -> None:

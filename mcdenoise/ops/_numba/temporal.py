@@ -303,6 +303,8 @@ def _prefer_label(
 def _normalize(total: Any, weights: Any, places: Any) -> None:
     for i in range(total.size):
         total[i] = weights[0, i] + weights[1, i] + weights[2, i] + weights[3, i]
+        if total[i] < np.finfo(total.dtype).tiny:
+            total[i], weights[:, i] = 0, 0
         safe = places[0, i]
         for tap in range(1, 4):
             safe = places[tap, i] if weights[tap, i] > 0 else safe
