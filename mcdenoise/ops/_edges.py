@@ -109,7 +109,10 @@ def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int]
 
     def weight(dy: int, dx: int) -> Tensor:
         squared = (shifted(padded, radius, dy, dx, height, width) - normal).square().sum(1, keepdim=True)
-        return (1 - squared / 2).clamp_min(0) ** sigma  # Eq. 4
+        cosine = 1 - squared / 2
+        alike = cosine > 0
+        # The second derivative of a power of 0 may be infinite.
+        return torch.where(alike, torch.where(alike, cosine, 1) ** sigma, 0)  # Eq. 4
 
     return weight
 

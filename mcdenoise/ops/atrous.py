@@ -16,7 +16,7 @@ SIGMA_L = 4.0
 # h of Eq. 1, along one axis.
 _KERNEL = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
 # The smallest deviation: the epsilon of Eq. 5, which the paper leaves open.
-_LEAST_DEVIATION = 1e-10
+_LEAST_DEVIATION = 1e-18
 
 
 @made_of(average)
@@ -41,7 +41,7 @@ def atrous(
     - ``w_n = max(0, n[p] . n[q])^sigma_n`` (Eq. 4), as ``max(0, 1 - |n[p] - n[q]|^2 / 2)^sigma_n``, which is the same
       for unit normals, and 1 for two pixels without one,
     - ``w_l = exp(-|l[p] - l[q]| / (sigma_l sqrt(g(variance)[p])))`` (Eq. 5), with the luminance ``l`` of
-      :func:`mcdenoise.ops.luminance_moments` and the 3x3 Gaussian ``g``; a deviation is at least 1e-10.
+      :func:`mcdenoise.ops.luminance_moments` and the 3x3 Gaussian ``g``; a deviation is at least 1e-18.
 
     ``slope`` is the difference of the depths of two neighbouring pixels, on that side on which it is smaller: the other
     may lie beyond an edge. Pixels that hit nothing are alike in depth, and unlike all others.

@@ -68,6 +68,14 @@ def test_a_still_camera_moves_nothing(name: str) -> None:
     assert torch.equal(*images)
 
 
+@pytest.mark.parametrize("name", ["svgf", "asvgf"])
+def test_light_in_a_large_unit_is_filtered_alike(name: str) -> None:
+    """The squares of its luminances are 1e-24."""
+    given, model = frame(), create_model(name)
+    dim = model(given.replace(color=given.color * 2.0**-40))[0].image
+    torch.testing.assert_close(dim * 2.0**40, model(given)[0].image)
+
+
 def test_the_first_level_feeds_the_history() -> None:
     given = frame()
     output, state = Svgf()(given)
@@ -109,3 +117,12 @@ def test_a_frame_without_motion_has_no_history() -> None:
         given = frame(seed=seed).replace(motion=None)
         torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
     assert denoiser.report.reset == "no motion, and no position with a previous camera"
+
+
+@pytest.mark.parametrize("sigma_n", [1.0, 1.5, 128.0])
+def test_the_second_derivative_at_a_right_angle_is_finite(sigma_n: float) -> None:
+    given = frame()
+    normal = given.normal.clone().requires_grad_()
+    filtered, _ = atrous(given.color, torch.ones_like(given.depth), normal, sigma_n=sigma_n)
+    slope = torch.autograd.grad(filtered.square().sum(), normal, create_graph=True)[0]
+    assert torch.autograd.grad(slope.square().sum(), normal)[0].isfinite().all()
