@@ -21,10 +21,15 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.noisy import Noisy, accumulated
+from mcdenoise.ops._numbers import unit_of
 
 Quality = Literal["fast", "balanced", "high"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]
 Source = Literal["raw", "accumulated", "demodulated", "accumulated after"]
+
+
+# Mean radiance below which an image is brightened for the library.
+_DIM = 1e-4
 
 
 class Filters(nn.Module):
@@ -128,13 +133,20 @@ class Oidn(Filters):
     def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
         """Run the library's filter, one image of the batch at a time, in float32; see :meth:`Filters.filtered`.
 
+        A dim color is divided by a power of two before it, and its result multiplied.
+
         Raises:
             InputError: a derivative in the color is requested; it would silently be zero.
             RuntimeError: the library reports an error; the message is the library's.
         """
         if torch.is_grad_enabled() and "color" in images and images["color"].requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
-        first = next(iter(images.values()))
+        first, unit = next(iter(images.values())), torch.ones(())
+        if "color" in images:
+            mean = images["color"].detach().mean((1, 2, 3), keepdim=True)
+            # The library takes light below 1e-8 for black, whatever its unit.
+            unit = torch.where(mean < _DIM, unit_of(mean), 1)
+            images = {**images, "color": images["color"] / unit}
         batch, _, height, width = first.shape
         self._resize(height, width)
         denoiser = self._filter(tuple(images), quality, clean)
@@ -145,7 +157,7 @@ class Oidn(Filters):
             denoiser.execute()
             self._check_device()
             results.append(self._images["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
-        return torch.stack(results)
+        return torch.stack(results) * unit
 
     def _resize(self, height: int, width: int) -> None:
         if self._images and self._images["output"].shape == (height, width, 3):
