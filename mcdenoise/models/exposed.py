@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from mcdenoise.errors import InputError
@@ -18,7 +19,8 @@ from mcdenoise.nn.inputs import auto_exposure
 class Exposed(Wrapper):
     """Multiplies the radiance by :func:`mcdenoise.nn.auto_exposure`, and divides every image of the result by it.
 
-    This makes a method independent of the unit of radiance: ``model(s x) = s model(x)``.
+    This makes a method independent of the unit of radiance: ``model(s x) = s model(x)``, also for a black image, to
+    which it adds less than 1e-18 of what the method does.
 
     Args:
         inner: any method but one that keeps radiance for the next frame, whose exposure is another.
@@ -39,7 +41,9 @@ class Exposed(Wrapper):
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure, and the statistics of the inner model for the exposed frame."""
-        exposure = auto_exposure(frame.color)
+        # Black has no unit: what the method sees in it is black in any.
+        lit = frame.color.amax((1, 2, 3), keepdim=True) > 0
+        exposure = torch.where(lit, auto_exposure(frame.color), torch.finfo(frame.color.dtype).max ** 0.5)
         exposed = scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
         return {**super().statistics(exposed), "exposure": exposure}
 
@@ -56,7 +60,7 @@ def scaled(frame: Frame, factor: Tensor) -> Frame:
     """The frame with all of its light multiplied by a factor, ``(B, 1, H, W)`` or ``(B, 1, 1, 1)``."""
     light = {name: image * factor for name, image in frame.items() if name in RADIANCE}
     samples = None if frame.samples is None else scale_samples(frame.samples, factor)
-    variance = None if frame.variance is None else frame.variance * factor.square()
+    variance = None if frame.variance is None else frame.variance * factor * factor
     skip = None if frame.skip is None else Skip(frame.skip.mask, frame.skip.image * factor)
     layers = {name: layer * factor for name, layer in frame.layers.items()}
     return frame.replace(**light, samples=samples, variance=variance, layers=layers, skip=skip)

@@ -27,7 +27,7 @@ _MULTIPLE = 1 << (_LEVELS - 1)
 # surrounding images, which stay float32.
 _LIVE_IMAGES = 100
 
-_KEY, _BIN, _DARK = 0.18, 16, 1e-8
+_KEY, _BIN, _DARK, _LEAST = 0.18, 16, 1e-8, 1e-30
 _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
@@ -147,17 +147,18 @@ def oidn_exposure(color: Tensor) -> Tensor:
         color: ``(B, 3, H, W)`` radiance.
 
     Returns:
-        ``(B, 1, 1, 1)``, positive, at least in float32; 1 for a black image. It has no gradient.
+        ``(B, 1, 1, 1)``, positive, at least in float32. A black image counts as one of 1e-30, so that what a network
+        sees in it, divided by the exposure, is none. It has no gradient.
     """
     color = color.detach().to(torch.promote_types(color.dtype, torch.float32))
     weights = numbers_like(color, _LUMINANCE).reshape(1, _COLORS, 1, 1)
     luminance = (color * weights).sum(1, keepdim=True)
     bins = _binned(_binned(luminance, 2), 3)
-    dark = _DARK * bins.mean((1, 2, 3), keepdim=True).clamp(1e-30, 1.0)
+    dark = _DARK * bins.mean((1, 2, 3), keepdim=True).clamp(_LEAST, 1.0)
     lit = bins > dark
     count = lit.sum((1, 2, 3), keepdim=True)
     mean = torch.where(lit, torch.log2(bins.maximum(dark)), 0).sum((1, 2, 3), keepdim=True) / count.clamp_min(1)
-    return torch.where(count > 0, _KEY / torch.exp2(mean), 1)
+    return _KEY / torch.where(count > 0, torch.exp2(mean), _LEAST)
 
 
 def _binned(image: Tensor, axis: int) -> Tensor:

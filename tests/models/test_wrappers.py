@@ -191,6 +191,15 @@ def test_exposed_methods_do_not_depend_on_the_unit_of_radiance(
     assert not torch.allclose(unlike, bare(frame)[0].image, rtol=0.1)
 
 
+def test_a_method_that_adds_light_adds_none_to_black() -> None:
+    frame, model = frame_of(20, 24, batch=2), Exposed(lambda color: Output(color + 1))
+    color = frame.color.clone()
+    color[1] = 0
+    image = model(frame.replace(color=color))[0].image
+    assert image[1].max() < 1e-18
+    torch.testing.assert_close(image[0], color[0] + 1 / auto_exposure(color)[0])
+
+
 @pytest.mark.parametrize("history", [Accumulated, Recurrent])
 def test_a_history_in_the_exposure_of_earlier_frames_is_refused(history: type[Accumulated | Recurrent]) -> None:
     with pytest.raises(InputError, match=rf"{history.__name__}\(Exposed"):
@@ -220,6 +229,10 @@ def test_all_radiance_is_exposed_alike_and_variance_by_the_square() -> None:
     torch.testing.assert_close(seen.samples[:, 0, :3], frame.color * exposure)
     assert torch.equal(seen.samples[:, 0, 3:], torch.ones(1, 2, 20, 24))
     torch.testing.assert_close(seen.skip.image, 3 * frame.color * exposure)
+    # In a large unit, the square of the exposure is infinite.
+    dim = {"color": frame.color * 2.0**-70, "variance": frame.variance * 2.0**-140}
+    Exposed(watching)(frame.replace(**dim))
+    assert watching.frames[1].variance.isfinite().all()
 
 
 def test_each_method_sees_the_image_of_the_one_before() -> None:
