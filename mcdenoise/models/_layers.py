@@ -184,7 +184,9 @@ def closed(frame: Frame, ask: Ask) -> Frame:
 
     ask(excess, refuse)
     rest = frame.color - total
-    least = _ROUNDING * frame.color + (len(frame.layers) + 1) * _SMALLEST_HALF
+    # A whole image of such small numbers is in a large unit, and was not rounded to them.
+    small = _ROUNDING * frame.color.mean((1, 2, 3), keepdim=True)
+    least = _ROUNDING * frame.color + small.clamp_max((len(frame.layers) + 1) * _SMALLEST_HALF)
     # Decide for the whole image: a layer that is dim in some pixels is a layer all the same.
     whole = (rest < 0) | ((rest <= least).all() & (total > 0))
     scale = torch.where(whole, frame.color / torch.where(whole, total, 1), 1)

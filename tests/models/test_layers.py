@@ -217,6 +217,13 @@ def test_layers_that_half_floats_rounded_sum_to_the_color() -> None:
     torch.testing.assert_close(dim.layers[REST], 0.01 * frame.color, rtol=1e-4, atol=1e-6)
 
 
+def test_the_unit_of_light_does_not_change_its_parts() -> None:
+    """Not even where all of it is less than the smallest half float."""
+    color = frame_of(*SIZE).color * 2.0**-40
+    layers = closed(Frame(color, layers={"diffuse": color / 2}), FrameReport().ask).layers
+    assert all(torch.equal(layers[name], color / 2) for name in ("diffuse", REST))
+
+
 def test_other_layers_than_before_are_refused_within_a_shot() -> None:
     denoiser = Denoiser(Demodulated(Accumulated(Noisy())))
     frames = shot(denoiser.model, 2)
