@@ -141,7 +141,8 @@ class Oidn(Filters):
         """
         if torch.is_grad_enabled() and "color" in images and images["color"].requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
-        first, unit = next(iter(images.values())), torch.ones(())
+        first = next(iter(images.values()))
+        unit = first.new_ones(())
         if "color" in images:
             mean = images["color"].detach().mean((1, 2, 3), keepdim=True)
             # The library takes light below 1e-8 for black, whatever its unit.

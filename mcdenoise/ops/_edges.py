@@ -110,9 +110,9 @@ def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int]
     def weight(dy: int, dx: int) -> Tensor:
         squared = (shifted(padded, radius, dy, dx, height, width) - normal).square().sum(1, keepdim=True)
         cosine = 1 - squared / 2
-        alike = cosine > 0
+        unlike = cosine <= 0
         # The second derivative of a power of 0 may be infinite.
-        return torch.where(alike, torch.where(alike, cosine, 1) ** sigma, 0)  # Eq. 4
+        return torch.where(unlike, 0, torch.where(unlike, 1, cosine) ** sigma)  # Eq. 4
 
     return weight
 
