@@ -141,13 +141,13 @@ class Oidn(Filters):
         """
         if torch.is_grad_enabled() and "color" in images and images["color"].requires_grad:
             raise InputError("oidn: expected a color without gradients, found one with; the library has no derivatives")
-        first = next(iter(images.values()))
-        unit = first.new_ones(())
+        first, unit = next(iter(images.values())), None
         if "color" in images:
             mean = images["color"].detach().mean((1, 2, 3), keepdim=True)
             # The library takes light below 1e-8 for black, whatever its unit.
-            unit = torch.where(mean < _DIM, unit_of(mean), 1)
-            images = {**images, "color": images["color"] / unit}
+            if (mean < _DIM).any():
+                unit = torch.where(mean < _DIM, unit_of(mean), 1)
+                images = {**images, "color": images["color"] / unit}
         batch, _, height, width = first.shape
         self._resize(height, width)
         denoiser = self._filter(tuple(images), quality, clean)
@@ -158,7 +158,7 @@ class Oidn(Filters):
             denoiser.execute()
             self._check_device()
             results.append(self._images["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
-        return torch.stack(results) * unit
+        return torch.stack(results) if unit is None else torch.stack(results) * unit
 
     def _resize(self, height: int, width: int) -> None:
         if self._images and self._images["output"].shape == (height, width, 3):

@@ -50,11 +50,13 @@ def examine(shot: RenderedFiles, color_has_albedo: bool | None) -> dict[str, Ima
         if not 0.5 < np.median(length[length > 0.05] if (length > 0.05).any() else [1.0]) < 1.5:
             shot.warnings.append("'normal': most have no unit length; is it a normal? leave it out with --map normal=")
     if "depth" in images:
-        far, behind = nothing_hit(images["depth"]), nothing_hit(-images["depth"])
-        # A single value may be a placeholder.
-        if far.all() and np.unique(images["depth"][~behind]).size > 1:
-            shot.negative_depths, images["depth"], far = True, -images["depth"], behind
-            readings["depth"].append("all negative: negated")
+        far = nothing_hit(images["depth"])
+        if far.all():
+            behind = nothing_hit(-images["depth"])
+            # A single value may be a placeholder.
+            if np.unique(images["depth"][~behind]).size > 1:
+                shot.negative_depths, images["depth"], far = True, -images["depth"], behind
+                readings["depth"].append("all negative: negated")
         what = (
             "background: none"
             if not far.any()
