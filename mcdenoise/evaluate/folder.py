@@ -139,7 +139,7 @@ def find_images(folder: Path, numbers: Collection[int]) -> dict[int, Path]:
         raise InputError(f"{folder}: expected denoised EXR images, found none; check the path")
     (group, *others), _ = group_files([path for path in paths if _OURS.fullmatch(path.stem)] or paths)
     if others:
-        shown = ", ".join(next(iter(each.files.values())).name for each in (group, others[-1]))
+        shown = ", ".join(each.first.name for each in (group, others[-1]))
         raise InputError(
             f"{folder}: expected names that differ in one number, that of the frame, such as denoised12.exr or "
             f"frame.0012.exr, found {shown}; keep only one series of images in the folder"

@@ -33,6 +33,11 @@ class FileGroup:
     label: str
     files: Mapping[int, Path]
 
+    @property
+    def first(self) -> Path:
+        """The file of its first frame."""
+        return next(iter(self.files.values()))
+
 
 def find_files(inputs: Sequence[Path]) -> list[Path]:
     """Find the image files for given folders, files and patterns, sorted.
@@ -122,7 +127,7 @@ def group_files(paths: Sequence[Path]) -> tuple[list[FileGroup], str]:
 
 def _named_by_folders(groups: list[FileGroup]) -> list[FileGroup]:
     """Name files of equal names in several folders after these: `albedo/0001.exr` beside `color/0001.exr`."""
-    folders = [_first(group).parent for group in groups]
+    folders = [group.first.parent for group in groups]
     count = Counter(label for label, _ in {(g.label, each) for g, each in zip(groups, folders, strict=True)})
     return [
         replace(group, label=folder.name) if count[group.label] > 1 else group
@@ -189,14 +194,14 @@ def patterns_of(groups: Sequence[FileGroup]) -> list[str]:
     """The file names of all kinds, behind the name of the folder where several have the same."""
     patterns = [pattern_of(group) for group in groups]
     return [
-        f"{_first(group).parent.name}/{pattern}" if patterns.count(pattern) > 1 else pattern
+        f"{group.first.parent.name}/{pattern}" if patterns.count(pattern) > 1 else pattern
         for group, pattern in zip(groups, patterns, strict=True)
     ]
 
 
 def pattern_of(group: FileGroup) -> str:
     """The file names of a kind, with # for the digits of the frame number."""
-    path = _first(group)
+    path = group.first
     digits = list(_DIGITS.finditer(path.stem))
     if len(group.files) > 1:
         for place in range(len(digits) - 1, -1, -1):
@@ -205,7 +210,3 @@ def pattern_of(group: FileGroup) -> str:
                 start, end = digits[place].span()
                 return f"{path.name[:start]}{'#' * (end - start)}{path.name[end:]}"
     return path.name
-
-
-def _first(group: FileGroup) -> Path:
-    return next(iter(group.files.values()))

@@ -76,7 +76,7 @@ def open_files(
     Raises:
         InputError: the files cannot be recognised, do not match one another, or cannot be read.
     """
-    first_files = [next(iter(group.files.values())) for group in groups]
+    first_files = [group.first for group in groups]
     headers = [*map(read_image_header, first_files)]
     layers = [
         replace(layer, files=pattern)
@@ -177,7 +177,7 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
         missing = [number for number in shot.numbers if not shot.has(layer, number)]
         if missing and name != "reference":
             group = shot.groups[layer.group]
-            place = next(iter(group.files.values())).parent / pattern_of(group)
+            place = group.first.parent / pattern_of(group)
             raise InputError(
                 f"{place}: expected buffer '{name}' for every frame, found none for frame {missing[0]}; render it, or "
                 f"leave the buffer out with --map {name}="
