@@ -59,19 +59,6 @@ def test_images_that_are_accumulated_as_well_have_the_weights_of_the_color() -> 
     assert not torch.equal(seen.color, frame.color)
 
 
-def test_a_cut_resets() -> None:
-    history = Shot()
-    floor = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)
-    wall = floor.roll(1, 1)
-    history.update(still(constant(3), normal=floor))
-    history.update(still(constant(3), normal=floor))
-    seen = history.update(still(constant(3, 2.0), normal=wall))
-    assert seen.reset == "cut"
-    assert seen.color.unique().tolist() == [2]
-    assert seen.length.unique().tolist() == [1]
-    assert history.update(still(constant(3, 2.0), normal=wall)).length.unique().tolist() == [2]
-
-
 @pytest.mark.parametrize("in_graph", [False, True])
 def test_each_image_of_a_batch_is_a_shot_of_its_own(in_graph: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """One stands still, one moves, and one cuts to caustics."""
@@ -437,9 +424,12 @@ def test_the_method_inside_begins_anew_with_the_shot(reset: str) -> None:
     assert (now["seen"].max(), next_one["seen"].max()) == (1, 2)
     size = (4, 4) if reset == "size change" else (HEIGHT, WIDTH)
     buffers = {"normal": None if size == (4, 4) else floor, **CUTS[reset]}
-    seen = history.update(still(constant(3, 2.0, size), **buffers))
-    assert seen.reset == reset
+    frame = still(constant(3, 2.0, size), **buffers)
+    seen = history.update(frame)
+    assert (seen.reset, seen.length.unique().tolist(), seen.color.unique().tolist()) == (reset, [1], [2])
     assert history.watching.states[-1] is None
+    # The next frame has a history, if it tells its motion.
+    assert history.update(frame).length.unique().tolist() == [1 if frame.motion is None else 2]
 
 
 @pytest.mark.parametrize("by_positions", [False, True])

@@ -139,14 +139,3 @@ def test_the_ablations(cascade: str, bilateral: bool, normalize: Any) -> None:
     assert torch.isfinite(output.image).all()
     assert (output.image >= 0).all()
     assert not torch.equal(output.image, frame.color)
-
-
-@torch.no_grad()
-def test_accumulation_is_the_published_average() -> None:
-    model, state = small("cascaded"), None
-    frames = [whole_frame(model, 12, 14, seed=seed).replace(motion=torch.zeros(1, 2, 12, 14)) for seed in range(7)]
-    expected = frames[0].color
-    for number, frame in enumerate(frames):
-        output, state = model(frame, state)
-        expected = torch.lerp(expected, frame.color, max(1 / (number + 1), 0.2))
-        torch.testing.assert_close(output.stages["accumulated"], expected, rtol=1e-5, atol=1e-6)

@@ -3,24 +3,19 @@
 import pytest
 import torch
 from kornia.filters import guided_blur
+from toys import frame_of
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
 from mcdenoise.models.guided import Guided
 
 
-def frame(height: int = 40, width: int = 44, seed: int = 0) -> Frame:
-    generator = torch.Generator().manual_seed(seed)
-    color, albedo, normal, depth = (torch.rand(1, c, height, width, generator=generator) for c in (3, 3, 3, 1))
-    return Frame(color=color, albedo=albedo, normal=torch.nn.functional.normalize(normal, dim=1), depth=1 + depth)
-
-
 def test_is_the_filter_of_kornia() -> None:
-    given = frame()
+    given = frame_of(40, 44, depth=1 + torch.rand(1, 1, 40, 44)).to(torch.float64)
     typical = torch.exp(torch.log(given.depth).mean())
     guide = torch.cat([given.albedo, given.normal, 10 * given.depth / (given.depth + typical)], 1)
     expected = guided_blur(guide, given.color, 7, 0.05, border_type="replicate").clamp_min(0)
-    torch.testing.assert_close(Guided(3, 0.05)(given)[0].image, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(Guided(3, 0.05)(given)[0].image, expected, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize("model", ["guided", "joint_bilateral"])

@@ -316,17 +316,10 @@ def test_a_method_without_kernels_is_split_by_filtered_proportions() -> None:
     assert error.mean() < 0.04
     assert error[..., 18:22].mean() < 0.05
     torch.testing.assert_close(parts["a"] + parts["b"], clean)
-    denoiser = Denoiser(Ones())
+    denoiser = Denoiser(Layered())
     output = denoiser.output(frame)
     torch.testing.assert_close(output.layers["a"], parts["a"])
     assert denoiser.report.stages["layers"].reason.endswith("the method has no kernels")
-
-
-class Ones(nn.Module):
-    needs = Needs(trainable=False)
-
-    def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
-        return Output(torch.ones_like(frame.color)), None
 
 
 class Layered(nn.Module):

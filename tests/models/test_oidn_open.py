@@ -101,16 +101,6 @@ def test_tiles_are_the_whole_image() -> None:
     assert tiles.report.tiles.startswith("6 x 4 tiles")
 
 
-@has_oidn
-def test_refuses_unsupported_options() -> None:
-    for name, value in (("auxiliary", "prefiltered"), ("auxiliary", "none"), ("quality", "low")):
-        message = refused(lambda name=name, value=value: create_model(NAME, **{name: value}))
-        assert f"{name}: expected one of" in message
-        assert value in message
-    model = create_model(NAME)
-    assert model.needs.missing(Frame(torch.rand(1, 3, 8, 8))) == ["albedo", "normal"]
-
-
 def written_out(unet: OidnUNet, x: Tensor) -> Tensor:
     """The base network layer by layer, as the library names them."""
 

@@ -17,24 +17,20 @@ def panorama(turn: int = 0, *, width: int = 160, number: int = 0) -> Frame:
     motion = torch.zeros(1, 2, 40, width)
     motion[:, 0] = -3
     frame = Frame(color, albedo=0.5 * torch.ones_like(color), alpha=torch.ones_like(color[:, :1]), motion=motion)
-    return frame.map(lambda image: image.roll(turn, -1))
+    return frame.map(lambda image: image.roll(turn + 3 * number, -1))
 
 
 @pytest.mark.parametrize("model", ["joint_bilateral", "accumulated"])
 def test_the_first_column_may_be_any(model: str) -> None:
     here, there = Denoiser(model, wrap=True, alpha=True), Denoiser(model, wrap=True, alpha=True)
     for number in range(3):
-        image = here.output(panorama(number=number).map(lambda x, n=3 * number: x.roll(n, -1)))
-        turned = there.output(panorama(80, number=number).map(lambda x, n=3 * number: x.roll(n, -1)))
+        image, turned = here.output(panorama(number=number)), there.output(panorama(80, number=number))
         torch.testing.assert_close(turned.image, image.image.roll(80, -1), rtol=1e-3, atol=1e-4)
         assert image.alpha.shape == (1, 1, 40, 160)
         assert all(stage.shape[-1] == 160 for stage in image.stages.values())
     bare = Denoiser(model), Denoiser(model)
     for number in range(2):
-        plain = [
-            denoiser(panorama(turn, number=number).map(lambda x, n=3 * number: x.roll(n, -1)))
-            for denoiser, turn in zip(bare, (0, 80), strict=True)
-        ]
+        plain = [denoiser(panorama(turn, number=number)) for denoiser, turn in zip(bare, (0, 80), strict=True)]
     assert (plain[1] - plain[0].roll(80, -1)).abs().max() > 0.01
 
 

@@ -105,19 +105,6 @@ def test_exact_skipping_changes_no_pixel(precision: Any, shot: str) -> None:
     assert names <= {"noise-free pixels"} | absent
 
 
-def test_the_network_does_not_run_on_the_sky() -> None:
-    size = (320, 224)
-    short, whole = pair()
-    frame = sky(wall(0, size=size), 200)
-    image, expected = short(frame), whole(frame)
-    # Convolutions choose the order of their sums by the size of the image and the number of threads.
-    torch.testing.assert_close(image, expected, rtol=1e-5, atol=1e-5 * float(expected.mean()))
-    # Down from row 192, a multiple of 32, and 64 rows above it that the network looks at.
-    assert stage(short, "network").skipped == pytest.approx(192 / 320)
-    assert stage(whole, "network").skipped == 0
-    assert torch.equal(short(frame)[..., :200, :], frame.color[..., :200, :])
-
-
 def test_a_method_of_unknown_reach_runs_and_known_pixels_are_kept() -> None:
     class Half(nn.Module):
         calls = 0

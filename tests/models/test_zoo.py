@@ -23,6 +23,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "mrkp": {"kernel_size": 2},
     "nbgd": {"layers": 1},
     "nppd": {"width": 0, "backbone": "resnet"},
+    "oidn_open": {"quality": "low", "auxiliary": "prefiltered"},
     "oidn": {"quality": "best", "auxiliary": "none", "source": "none", "threads": 0},
     "oidn_temporal": {"auxiliary": "clean", "engine": "none", "prefilter": "none", "history": 0.0},
     "sbmc": {"width": 0, "rounds": 0, "convolutions": 0, "kernel_size": 0},
