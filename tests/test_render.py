@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import refuses, succeeds
 
-from mcdenoise.cli import main
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.errors import InputError
@@ -555,7 +555,7 @@ XML = """<scene version="3.0.0">
 </scene>"""
 
 
-def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path) -> None:
     scene, path, out = (tmp_path / name for name in ("scene.xml", "shot.json", "out"))
     scene.write_text(XML)
     camera = Camera.look_at((0, 1, 8), (-1, 0, 0), fov_x=60).to_world.tolist()
@@ -566,10 +566,7 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     path.write_text(json.dumps(content))
     command = ["render", str(scene), "--camera-path", str(path), "-o", str(out), "--size", "16x12"]
     command += ["--variant", "scalar_rgb", "--reference-spp", "32", "--noise-seeds", "2", "--noise-level", "0.5"]
-    with pytest.raises(SystemExit) as ended:
-        main(command)
-    assert ended.value.code == 0
-    assert capsys.readouterr().out.strip() == str(out / "inputs")
+    assert succeeds(*command).strip() == str(out / "inputs")
     sequence = open_sequence(out)
     assert (len(sequence), sequence.noise_seeds) == (2, 2)
     frame = sequence.frame(1)
@@ -577,18 +574,11 @@ def test_the_command_line_moves_objects_of_a_scene_file(tmp_path: Path, capsys: 
     step = step[:, :, (step != 0).any(1)[0]]
     assert step.shape[2] > 5
     torch.testing.assert_close(step.mean(2), torch.tensor([[0.5, 0, 0]]))
-    with pytest.raises(SystemExit) as ended:
-        main([*command[:5], str(tmp_path / "every"), *command[6:], "--every", "2"])
-    assert ended.value.code == 0
+    succeeds(*command[:5], tmp_path / "every", *command[6:], "--every", 2)
     assert len(open_sequence(tmp_path / "every")) == 1
-    capsys.readouterr()
     path.write_text(json.dumps({**content, "objects": {"teapot": objects["moving"]}}))
-    with pytest.raises(SystemExit) as ended:
-        main([*command[:5], str(tmp_path / "new"), *command[6:]])
-    assert ended.value.code == 2
-    message = capsys.readouterr().err
+    message = refuses(*command[:5], tmp_path / "new", *command[6:])
     assert "object 'teapot': expected the id of a shape or a light that can move (lamp, moving, still)" in message
-    assert message.count("\n") == 1
 
 
 def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:

@@ -149,19 +149,8 @@ def test_a_factory_is_of_a_file_or_a_package_and_returns_a_model(name: str, here
     assert not (here / "out").exists()
 
 
-MODULES = [
-    "numpy",
-    "torch",
-    "mitsuba",
-    "drjit",
-    "typing",
-    "socket",
-    "pickle",
-    "json",
-    "random",
-    "multiprocessing",
-    "bpy",
-]
+MODULES = ["numpy", "torch", "mitsuba", "drjit", "typing", "socket", "pickle"]
+MODULES += ["json", "random", "multiprocessing", "bpy"]
 
 
 @pytest.mark.parametrize(

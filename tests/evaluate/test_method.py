@@ -5,28 +5,14 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-import torch
 from pictures import part_of
-from torch import Tensor
+from toys import Watching
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.evaluate import evaluate_folder, evaluate_method
 from mcdenoise.folder import denoise_sequence
-from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Needs, Output
-
-
-class Counting:
-    needs = Needs(trainable=False)
-
-    def __init__(self) -> None:
-        self.seen: list[int] = []
-
-    def __call__(self, frame: Frame, state: Tensor | None = None) -> tuple[Output, Tensor]:
-        count = torch.ones(1) if state is None else state + 1
-        self.seen.append(int(count))
-        return Output(frame.color), count
+from mcdenoise.models import Accumulated
 
 
 @pytest.fixture
@@ -59,7 +45,7 @@ def test_files_with_windows_of_their_own_are_compared_where_they_are(tmp_path: P
 
 def test_a_method_sees_frames_without_a_reference_too(small_sequence: Path) -> None:
     (small_sequence / "inputs" / "reference1.exr").unlink()
-    model = Counting()
-    result = evaluate_method(open_sequence(small_sequence), Denoiser(model), "counting")
-    assert model.seen == [1, 2, 3, 4]
+    model = Watching()
+    result = evaluate_method(open_sequence(small_sequence), Denoiser(model), "watching")
+    assert [state is None for state in model.states] == [True, False, False, False]
     assert result.tables["strict"].counts["SMAPE"] == 3

@@ -14,7 +14,7 @@ from torch.utils import _pytree as pytree
 from toys import Mean, Shot, Watching, still, whole_frame
 
 from mcdenoise.data import open_sequence
-from mcdenoise.frame import Frame, Hints
+from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated
 from mcdenoise.ops import accumulate, demodulate, remodulate
 from mcdenoise.ops._backend import Backend
@@ -453,18 +453,6 @@ def test_a_state_of_zeros_is_no_state(size: tuple[int, int], by_positions: bool)
     assert pytree.tree_structure(again) == pytree.tree_structure(state)
     for one, other in zip(pytree.tree_leaves(again), pytree.tree_leaves(state), strict=True):
         assert one is other or torch.equal(one, other)
-
-
-def test_the_inner_method_gets_the_history_and_its_image_is_the_result() -> None:
-    watching = Watching()
-    color = torch.rand(1, 3, HEIGHT, WIDTH)
-    output, _ = Accumulated(watching)(still(color).replace(hints=Hints(keep_all=True)))
-    assert list(output.stages) == ["accumulated"]
-    assert torch.equal(output.stages["accumulated"], output.image)
-    frame = watching.frames[0]
-    assert frame.hints.keep_all
-    assert torch.equal(frame.color, color)
-    assert {"current", "length"} <= frame.buffers
 
 
 def test_buffers_that_accumulation_provides_are_not_needed_of_a_frame() -> None:

@@ -545,7 +545,6 @@ def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
         assert message.startswith(f"{beside}{setting}={value}; the weights fix size; ")
         assert message.endswith(": wild_large, wild_small")
     create_model("wild", pretrained=True, size="base")
-    assert "alpha_min: " in refused(lambda: create_model("wild_small", pretrained=True, alpha_min=2.0))
 
 
 def test_settings_in_a_name_are_refused_with_the_call_that_has_them() -> None:

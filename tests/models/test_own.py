@@ -157,9 +157,12 @@ def test_an_argument_that_is_no_buffer_is_named() -> None:
     assert Denoiser(lambda color, x: color)(frame(extra={"x": torch.ones(1, 1, *SIZE)})).shape == (1, 3, *SIZE)
 
 
-def test_weights_of_half_precision_are_named() -> None:
+@pytest.mark.parametrize("name", ["float16", "float64"])
+def test_weights_of_another_precision_than_the_frame_are_named(name: str) -> None:
     class Convolution(nn.Conv2d):
         def forward(self, color: Tensor) -> Tensor:
             return super().forward(color)
 
-    assert "float16 weights" in refused(lambda: Denoiser(Convolution(3, 3, 1).half())(frame()))
+    network = Convolution(3, 3, 1).to(getattr(torch, name))
+    assert f"{name} weights" in refused(lambda: Denoiser(network)(frame()))
+    assert Denoiser(network.float())(frame()).dtype == torch.float32
