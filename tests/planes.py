@@ -90,3 +90,10 @@ def pixel_rays(camera: Camera, width: int, height: int) -> Rays:
     across, down = np.meshgrid(x * tan, y * (tan * height / width))
     ways = np.stack([across, down, np.ones_like(across)], -1).reshape(-1, 3) @ camera.to_world[:3, :3].T
     return Rays(camera.to_world[:3, 3], ways / np.linalg.norm(ways, axis=1, keepdims=True))
+
+
+def seen_at(position: Any, matrix: Any) -> tuple[Any, Any, Any]:
+    """Columns and rows in the image of world positions ``(H, W, 3)``, and their places in clip space."""
+    height, width, _ = position.shape
+    clip = np.concatenate([position, np.ones((height, width, 1))], -1) @ np.asarray(matrix, np.float64)
+    return (clip[..., 0] / clip[..., 3] + 1) / 2 * width, (clip[..., 1] / clip[..., 3] + 1) / 2 * height, clip

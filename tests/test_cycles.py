@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planes import pixel_rays
+from planes import pixel_rays, seen_at
 
 from mcdenoise.cli.generate import generate
 from mcdenoise.data import open_sequence
@@ -207,14 +207,11 @@ def test_sky_is_far_along_the_rays_and_albedo_is_clamped() -> None:
     assert list(buffers)[-1] == "color"
     np.testing.assert_array_equal(buffers["albedo"][0, 0], (1, 0, 0))
     assert np.isinf(buffers["depth"]).sum() == 4 * 6 - 1
-    positions = np.concatenate([buffers["position"], np.ones((4, 6, 1))], -1)
-    clip = positions @ view_projection(camera, 6, 4, 0.1, 1e5)
-    x = (clip[..., 0] / clip[..., 3] + 1) / 2 * 6 - 0.5
-    y = (clip[..., 1] / clip[..., 3] + 1) / 2 * 4 - 0.5
+    x, y, clip = seen_at(buffers["position"], view_projection(camera, 6, 4, 0.1, 1e5))
     sky = np.isinf(buffers["depth"][..., 0])
     rows, columns = np.nonzero(sky)
-    np.testing.assert_allclose(x[sky], columns, atol=1e-9)
-    np.testing.assert_allclose(y[sky], rows, atol=1e-9)
+    np.testing.assert_allclose(x[sky] - 0.5, columns, atol=1e-9)
+    np.testing.assert_allclose(y[sky] - 0.5, rows, atol=1e-9)
     np.testing.assert_allclose(clip[sky][:, 3], 4000.0)
 
 

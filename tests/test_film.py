@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from planes import seen_at
 
 from mcdenoise.data.exr import read_exr
 from mcdenoise.errors import InputError
@@ -100,12 +101,9 @@ def test_every_noise_seed_has_features_of_its_own_samples(sequence: Path) -> Non
 def test_positions_are_seen_within_the_filter_of_their_pixels(tmp_path: Path) -> None:
     """Box and wall: the sample of a pixel lies in that pixel, and its depth is the distance along the axis."""
     folder = render_sequence(wall(), AT_WALL, tmp_path, reference_spp=1, film=Film("box"), **SCALAR)
-    matrix = np.array(json.loads((folder / "camera.json").read_text())["camera_matrices"][0])
-    position = read(folder, "world_position0")
-    clip = np.concatenate((position, np.ones((HEIGHT, WIDTH, 1))), axis=-1) @ matrix
-    column = (clip[..., 0] / clip[..., 3] + 1) / 2 * WIDTH - np.arange(WIDTH)
-    row = (clip[..., 1] / clip[..., 3] + 1) / 2 * HEIGHT - np.arange(HEIGHT)[:, None]
-    for offset in (column, row):
+    (matrix,) = json.loads((folder / "camera.json").read_text())["camera_matrices"]
+    column, row, clip = seen_at(read(folder, "world_position0"), matrix)
+    for offset in (column - np.arange(WIDTH), row - np.arange(HEIGHT)[:, None]):
         assert offset.min() > -1e-3
         assert offset.max() < 1 + 1e-3
         assert 0.2 < offset.std() < 0.4  # that of even numbers is 0.29

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refuses, succeeds
+from planes import seen_at
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
@@ -64,11 +65,8 @@ def describe(folder: Path) -> dict[str, Any]:
 
 def test_positions_project_to_their_pixel_centres(sequence: Path) -> None:
     for number in range(3):
-        matrix = np.array(describe(sequence)["camera_matrices"][number])
-        position = read(sequence, f"world_position{number}").astype(np.float64)
-        clip = np.concatenate((position, np.ones((HEIGHT, WIDTH, 1))), axis=-1) @ matrix
-        column = (clip[..., 0] / clip[..., 3] + 1) / 2 * WIDTH
-        row = (clip[..., 1] / clip[..., 3] + 1) / 2 * HEIGHT
+        position, matrix = read(sequence, f"world_position{number}"), describe(sequence)["camera_matrices"][number]
+        column, row, clip = seen_at(position, matrix)
         assert np.abs(column - (np.arange(WIDTH) + 0.5)).max() < 1e-3
         assert np.abs(row - (np.arange(HEIGHT) + 0.5)[:, None]).max() < 1e-3
         depth = read(sequence, f"depth{number}")[..., 0]

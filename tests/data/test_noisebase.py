@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from planes import seen_at
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.readers import noisebase
@@ -170,12 +171,11 @@ def test_positions_are_seen_at_their_pixels(tmp_path: Path) -> None:
     frame = open_sequence(write(tmp_path / "frame2.zip", content)).frame(2)
     assert frame.variance is None
     position = frame.position[0].double().permute(1, 2, 0).numpy()
-    clip = np.concatenate([position, np.ones((*SIZE, 1))], -1) @ frame.view_projection[0].double().numpy()
-    u, v = ((clip[..., i] / clip[..., 3] + 1) / 2 for i in (0, 1))
+    x, y, clip = seen_at(position, frame.view_projection[0])
     spread = np.random.default_rng(2).random((2, *SIZE, 1))[..., 0]
     # Single precision of positions and matrix: some 1e-6 of a coordinate of a few units, over 40 pixels.
-    np.testing.assert_allclose(u * SIZE[1], columns + spread[0], atol=1e-3)
-    np.testing.assert_allclose(v * SIZE[0], rows + spread[1], atol=1e-3)
+    np.testing.assert_allclose(x, columns + spread[0], atol=1e-3)
+    np.testing.assert_allclose(y, rows + spread[1], atol=1e-3)
     depth = frame.depth[0, 0].numpy()
     assert np.isinf(depth[:3]).all()
     np.testing.assert_allclose(depth[3:], clip[3:, :, 3], rtol=1e-6)

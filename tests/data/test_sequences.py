@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planes import seen_at
 from refusals import refused
 
 from mcdenoise.data import open_sequence, read_exr, write_exr
@@ -19,10 +20,8 @@ RGB = ["R", "G", "B"]
 
 def pixel_index(position: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
     """(row, column) of every world position, written out as in the file format's description."""
-    _, height, width = position.shape
-    clip = torch.cat([position, torch.ones(1, height, width)]).double().permute(1, 2, 0) @ matrix.double()
-    u, v = (clip[..., 0] / clip[..., 3] + 1) / 2, (clip[..., 1] / clip[..., 3] + 1) / 2
-    return torch.stack([v * height - 0.5, u * width - 0.5])
+    column, row, _ = seen_at(position.permute(1, 2, 0).numpy(), matrix)
+    return torch.from_numpy(np.stack([row, column])) - 0.5
 
 
 def pixel_centres(height: int, width: int) -> torch.Tensor:

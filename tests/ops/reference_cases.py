@@ -21,6 +21,10 @@ TOLERANCE = {
 FAST = [op for op in OPS if "numba" in backends_of(op.function)]
 
 
+def draw(*shape: int, seed: int = 0) -> Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
 def by(backend: Backend, function: Callable[..., Any]) -> Callable[..., Any]:
     def run(*arguments: Any, **settings: Any) -> Any:
         with use(backend):

@@ -3,13 +3,10 @@ from typing import Any
 import kornia
 import pytest
 import torch
+from reference_cases import draw
 from torch import Tensor
 
 from mcdenoise.ops import cross_bilateral_filter, cross_bilateral_weights, kernel_conv
-
-
-def draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def constant(value: float, height: int, width: int, batch: int = 1) -> Tensor:

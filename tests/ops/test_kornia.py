@@ -2,13 +2,9 @@
 
 import kornia
 import torch
-from torch import Tensor
+from reference_cases import draw
 
 from mcdenoise.ops import downsample, kernel_splat, luminance_moments, motion_from_position, upsample
-
-
-def draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def test_the_same_kernel_everywhere_splats_as_filter2d_with_the_kernel_turned_around() -> None:

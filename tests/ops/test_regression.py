@@ -2,13 +2,10 @@
 
 import torch
 import torch.nn.functional as F
+from reference_cases import draw
 from torch import Tensor
 
 from mcdenoise.ops import block_regression
-
-
-def drawn(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def scene(height: int = 40, width: int = 50) -> Tensor:
@@ -21,12 +18,12 @@ def scene(height: int = 40, width: int = 50) -> Tensor:
 
 def test_an_image_linear_in_the_features_is_returned() -> None:
     """Only the ridge, 1e-8, makes a difference; in float32 that is less than a rounding."""
-    features, weights = scene(), drawn(3, 6) - 0.5
+    features, weights = scene(), draw(3, 6) - 0.5
     image = 2 + torch.einsum("cf,bfhw->bchw", weights, features - features.mean((2, 3), keepdim=True))
     for offset in ((0, 0), (5, 17)):
         found = block_regression(image, features, offset=offset)
         torch.testing.assert_close(found, image, rtol=0, atol=1e-5)
-        plain = block_regression(image, drawn(1, 6, 40, 50), offset=offset)
+        plain = block_regression(image, draw(1, 6, 40, 50), offset=offset)
         assert (plain - image).abs().max() > 0.1
 
 
@@ -46,7 +43,7 @@ def test_squares_are_fitted_wherever_the_origin_is() -> None:
 
 def test_features_that_say_nothing_new_change_nothing() -> None:
     """Multiples, sums, constants and zeros, which leave the normal equations singular; and another unit."""
-    image, features = drawn(1, 3, 40, 50), drawn(1, 2, 40, 50, seed=1)
+    image, features = draw(1, 3, 40, 50), draw(1, 2, 40, 50, seed=1)
     expected = block_regression(image, features)
     flat, total = torch.full_like(features[:, :1], 0.8), features.sum(1, keepdim=True)
     redundant = torch.cat([features, -3 * features, flat, 0 * flat, total, features + 5], 1)
@@ -56,10 +53,10 @@ def test_features_that_say_nothing_new_change_nothing() -> None:
 
 def test_a_flat_wall_is_its_mean() -> None:
     """The rounding of a constant normal in float32, 1e-7 of it, is no feature."""
-    image = drawn(1, 3, 32, 32).float()
+    image = draw(1, 3, 32, 32).float()
     normal = torch.tensor([0.6, 0.0, -0.8]).reshape(1, 3, 1, 1).expand(1, 3, 32, 32)
     mean = image.double().mean((2, 3), keepdim=True).float().expand_as(image)
     assert torch.equal(block_regression(image, normal), mean)
-    rounded = normal * (1 + 2.0**-25 * (2 * drawn(1, 3, 32, 32) - 1))
+    rounded = normal * (1 + 2.0**-25 * (2 * draw(1, 3, 32, 32) - 1))
     found = block_regression(image.double(), rounded)
-    assert (found - mean).abs().max() < 0.1 * (block_regression(image, drawn(1, 2, 32, 32)) - mean).abs().max()
+    assert (found - mean).abs().max() < 0.1 * (block_regression(image, draw(1, 2, 32, 32)) - mean).abs().max()

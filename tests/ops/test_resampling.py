@@ -3,16 +3,13 @@
 import pytest
 import torch
 import torch.nn.functional as F
+from reference_cases import draw
 from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.ops import resample
 
 BACKENDS = ("torch", "numba")
-
-
-def draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def by_torch(previous: Tensor, motion: Tensor) -> Tensor:

@@ -1,17 +1,13 @@
 import kornia
 import pytest
 import torch
-from reference_cases import by
+from reference_cases import by, draw
 from torch import Tensor
 
 from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject, use
 from mcdenoise.ops._backend import BACKENDS
 
 INF, NAN = torch.inf, torch.nan
-
-
-def draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def image(rows: list[list[float]]) -> Tensor:
