@@ -1,15 +1,16 @@
 """Rendering as Mitsuba's own renderer samples: filter, lens, and features with noise."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from planes import seen_at
+from refusals import refused
 
 from mcdenoise.data.exr import read_exr
-from mcdenoise.errors import InputError
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.render import FILTERS, Camera, Film, render_sequence
 from mcdenoise.scenes.render import frames as render_frames
@@ -133,5 +134,4 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
     for name in ("write_buffer", "write_noisy", "write_reference"):
         monkeypatch.setattr(render_frames, name, fail)
     render("a")
-    with pytest.raises(InputError, match=r"film .*'box'.*, .*None"):
-        render("a", film=None)
+    assert re.search(r"film .*'box'.*, .*None", refused(render, "a", film=None))

@@ -6,7 +6,6 @@ from refusals import refused
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, Hints, Skip
 from mcdenoise.ops import motion_from_position
 
@@ -92,16 +91,11 @@ def test_a_lamp_among_reflectances_is_clamped_with_a_warning() -> None:
 
 
 def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
-    with pytest.raises(InputError, match="buffer 'crypto'"):
-        Frame(color=plane(3), extra={"crypto": plane(5)[..., 1:]})
-    with pytest.raises(InputError, match="buffer 'crypto'"):
-        Frame(color=plane(3), extra={"crypto": plane(5).long()})
-    with pytest.raises(InputError, match="buffer 'crypto'"):
-        Frame(color=plane(3), extra={"crypto": plane(5, NAN)}).validate()
-    with pytest.raises(InputError, match="buffer 'crypto'"):
-        Frame(color=plane(3), extra={"crypto": plane(5)[:, :0]})
-    with pytest.raises(InputError, match="buffer 'samples'"):
-        Frame(color=plane(3), samples=plane(3)[:, None][:, :0])
+    assert "buffer 'crypto'" in refused(Frame, color=plane(3), extra={"crypto": plane(5)[..., 1:]})
+    assert "buffer 'crypto'" in refused(Frame, color=plane(3), extra={"crypto": plane(5).long()})
+    assert "buffer 'crypto'" in refused(Frame(color=plane(3), extra={"crypto": plane(5, NAN)}).validate)
+    assert "buffer 'crypto'" in refused(Frame, color=plane(3), extra={"crypto": plane(5)[:, :0]})
+    assert "buffer 'samples'" in refused(Frame, color=plane(3), samples=plane(3)[:, None][:, :0])
     assert Frame(color=plane(3), extra={"crypto": plane(5, -INF)}).validate()[1] == 0
 
 

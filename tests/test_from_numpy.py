@@ -1,5 +1,6 @@
 """Arrays in, an array out: what `Frame.from_numpy` and `denoise` take, in which layout, and what they refuse."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 from refusals import refused
 
-from mcdenoise import Denoiser, Frame, InputError, denoise
+from mcdenoise import Denoiser, Frame, denoise
 from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
 
 HEIGHT, WIDTH = 5, 7
@@ -134,14 +135,10 @@ def test_names_and_layouts_that_are_none() -> None:
         told = refused(denoise, color, layout="CHW")
         assert told.startswith("buffer 'color': expected shape (3, H, W), ")
         assert message in told
-    with pytest.raises(InputError, match=r"layout: .*'NHWC'"):
-        Frame.from_numpy(image(3), layout="NHWC")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"buffer 'normals'"):
-        Frame.from_numpy(image(3), normals=image(3))
-    with pytest.raises(InputError, match=r"extra: .*'albedo'"):
-        Frame.from_numpy(image(3), extra={"albedo": image(3)})
-    with pytest.raises(InputError, match=r"buffer 'crypto'"):
-        Frame.from_numpy(image(3), extra={"crypto": image(2)[1:]})
+    assert re.search(r"layout: .*'NHWC'", refused(Frame.from_numpy, image(3), layout="NHWC"))
+    assert "buffer 'normals'" in refused(Frame.from_numpy, image(3), normals=image(3))
+    assert re.search(r"extra: .*'albedo'", refused(Frame.from_numpy, image(3), extra={"albedo": image(3)}))
+    assert "buffer 'crypto'" in refused(Frame.from_numpy, image(3), extra={"crypto": image(2)[1:]})
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
 
 from mcdenoise import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import Repairs, repair, repairs_from, replace_invalid
 
@@ -79,8 +79,7 @@ def test_a_channel_without_positive_light_is_told_in_per_cent() -> None:
     color = flat(4, 4, value=1.0)
     color[:, 0] = -0.5
     assert "found 100.0% of the light negative" in repairs_of(color).doubt
-    with pytest.raises(InputError, match="found 100% of the light negative"):
-        replace_invalid(flat(4, 4, value=-1.0))
+    assert "found 100% of the light negative" in refused(replace_invalid, flat(4, 4, value=-1.0))
 
 
 @pytest.mark.parametrize("deviation", [0.1, 0.3, 0.5])
@@ -103,13 +102,10 @@ def test_noise_around_its_mean_keeps_its_mean_and_is_told(deviation: float) -> N
     "color", [signed(0, 1), signed(0.05, 1), -signed(5, 1), torch.linspace(-1, 0.2, 75).reshape(1, 3, 5, 5)]
 )
 def test_what_is_no_radiance_is_refused(color: Tensor) -> None:
-    with pytest.raises(InputError, match="buffer 'color'"):
-        replace_invalid(color)
-    with pytest.raises(InputError, match="layer 'part'"):
-        Frame(color=color.abs(), layers={"part": color}).validate()
+    assert "buffer 'color'" in refused(replace_invalid, color)
+    assert "layer 'part'" in refused(Frame(color=color.abs(), layers={"part": color}).validate)
     # One image of a batch is enough.
-    with pytest.raises(InputError, match="negative"):
-        replace_invalid(torch.cat([color.abs(), color]))
+    assert "negative" in refused(replace_invalid, torch.cat([color.abs(), color]))
 
 
 def test_the_rounding_of_black_is_no_negative_light() -> None:
@@ -129,8 +125,7 @@ def test_a_large_gap_lies_between_the_values_at_its_border() -> None:
 
 def test_a_frame_of_nan_is_refused() -> None:
     color = torch.cat([flat(4, 4), flat(4, 4, value=NAN)])
-    with pytest.raises(InputError, match="NaN in every pixel"):
-        replace_invalid(color)
+    assert "NaN in every pixel" in refused(replace_invalid, color)
 
 
 @pytest.mark.parametrize("radius", [1, 3, 6, 40])

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from refusals import refused
 from test_docs import DOCS, blocks
 from torch import Tensor
 
-from mcdenoise import Denoiser, Frame, InputError
+from mcdenoise import Denoiser, Frame
 from mcdenoise.integrations.mitsuba import MitsubaDenoiser
 from mcdenoise.scenes.render.loading import LLVM
 
@@ -328,8 +329,7 @@ def test_arguments_that_do_not_fit_are_told_in_one_line(mi: Any) -> None:
     for made, arguments, named, message in cases:
         assert message in refused(denoised, made, *arguments, **named)
     for wrong in ((64,), (64, 0), (64.5, 36)):
-        with pytest.raises(InputError, match="input_size:"):
-            MitsubaDenoiser(wrong)
+        assert "input_size:" in refused(MitsubaDenoiser, wrong)
 
 
 @pytest.mark.parametrize("missing", ["mitsuba", "drjit"])
@@ -337,5 +337,4 @@ def test_without_mitsuba_one_line_says_what_to_install(missing: str, monkeypatch
     if missing == "drjit":
         pytest.importorskip("mitsuba")
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(InputError, match=rf"{missing}.*mcdenoise\[render\]"):
-        MitsubaDenoiser((WIDTH, HEIGHT))
+    assert re.search(rf"{missing}.*mcdenoise\[render\]", refused(MitsubaDenoiser, (WIDTH, HEIGHT)))

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -12,10 +13,10 @@ import pytest
 import torch
 from commands import refuses, succeeds
 from planes import seen_at
+from refusals import refused
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
-from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
 from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
@@ -127,8 +128,7 @@ def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
     render(2)
     assert images(folder) == whole
     assert describe(folder) == description
-    with pytest.raises(InputError, match=r"seed 0, .*1"):
-        render(None, seed=1)
+    assert re.search(r"seed 0, .*1", refused(render, None, seed=1))
 
 
 def test_damaged_files_are_rendered_again(tmp_path: Path) -> None:
@@ -166,18 +166,17 @@ def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
     settings = {**SCALAR, "reference_frames": []}
     render_sequence(scene, demo_cameras(1), tmp_path, **settings)
     scene["window"] = {**scene["window"], "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}}
-    with pytest.raises(InputError, match="scene_sha256"):
-        render_sequence(scene, demo_cameras(1), tmp_path, **settings)
+    assert "scene_sha256" in refused(render_sequence, scene, demo_cameras(1), tmp_path, **settings)
 
 
 @pytest.mark.parametrize("missing", [None, "frames", "camera_matrices"])
 def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missing: str | None) -> None:
-    folder, cameras = tmp_path / "inputs", demo_cameras(9)
+    folder = tmp_path / "inputs"
     shutil.copytree(sequence, folder)
     about = {key: value for key, value in describe(folder).items() if key != missing}
     (folder / "camera.json").write_text(json.dumps(about) if missing else "{")
-    with pytest.raises(InputError, match=r"camera\.json:"):
-        render_sequence(demo_scene(), [cameras[0]], tmp_path, **{**SCALAR, "reference_frames": []})
+    settings = {**SCALAR, "reference_frames": []}
+    assert "camera.json:" in refused(render_sequence, demo_scene(), demo_cameras(9)[:1], tmp_path, **settings)
 
 
 def _furnace(albedo: float = 0.5) -> dict[str, Any]:
@@ -259,23 +258,21 @@ def test_view_projection_of_a_point_to_the_right_and_above() -> None:
     ],
 )
 def test_bad_settings(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        render_sequence(demo_scene(), demo_cameras(1), tmp_path, **{**SCALAR, **settings})
+    told = refused(render_sequence, demo_scene(), demo_cameras(1), tmp_path, **{**SCALAR, **settings})
+    assert re.search(message, told)
     assert not list(tmp_path.iterdir())
 
 
 def test_bad_scenes_and_folders(tmp_path: Path) -> None:
     def fails(scene: Any, message: str, out: Path = tmp_path / "out") -> None:
-        with pytest.raises(InputError, match=message) as caught:
-            render_sequence(scene, demo_cameras(1), out, **SCALAR)
-        assert "\n" not in str(caught.value)
+        assert message in refused(render_sequence, scene, demo_cameras(1), out, **SCALAR)
 
     broken = tmp_path / "broken.xml"
     broken.write_text("<scene version='3.0.0'><shape type='nonsense'/></scene>")
     file = tmp_path / "file"
     file.write_text("")
     fails(tmp_path / "no.xml", "no such file")
-    fails(broken, r"broken\.xml: Mitsuba cannot load it")
+    fails(broken, "broken.xml: Mitsuba cannot load it")
     fails({"type": "scene", "a": {"type": "nonsense"}}, "scene dictionary: Mitsuba cannot load it")
     fails({"type": "sphere"}, "expected a Mitsuba scene")
     fails(_furnace(), "expected a folder", out=file)
@@ -283,8 +280,7 @@ def test_bad_scenes_and_folders(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("without_mitsuba")
 def test_without_mitsuba_the_error_says_what_to_install(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"pip install 'mcdenoise\[render\]'"):
-        render_sequence(demo_scene(), demo_cameras(1), tmp_path)
+    assert "pip install 'mcdenoise[render]'" in refused(render_sequence, demo_scene(), demo_cameras(1), tmp_path)
 
 
 def test_passes_of_one_frame_do_not_reuse_the_noise_of_another(tmp_path: Path) -> None:
@@ -353,8 +349,8 @@ def test_a_reference_is_resumed_in_the_middle(tmp_path: Path, monkeypatch: pytes
     assert calls[-1] == (71, 71)
     (folder / "reference0.exr").unlink()
     (folder / "reference0.partial.npz").write_text("hello")
-    with pytest.raises(InputError, match=r"reference0\.partial\.npz:"):
-        render_sequence(demo_scene(), demo_cameras(1), folder.parent, **settings)
+    told = refused(render_sequence, demo_scene(), demo_cameras(1), folder.parent, **settings)
+    assert "reference0.partial.npz:" in told
 
 
 def test_refining_a_reference_continues_where_it_was(tmp_path: Path) -> None:
@@ -517,10 +513,8 @@ def test_the_path_of_an_object_cannot_change(moving: Path, tmp_path: Path) -> No
     shutil.copytree(moving, folder)
     moves = _moves()
     moves["ball"][1, 0, 3] += 1
-    with pytest.raises(InputError, match=r"object 'ball' .*frame 1"):
-        _render_moving(tmp_path, moves=moves)
-    with pytest.raises(InputError, match="ball, box, lamp"):
-        _render_moving(tmp_path, moves={})
+    assert re.search(r"object 'ball' .*frame 1", refused(_render_moving, tmp_path, moves=moves))
+    assert "ball, box, lamp" in refused(_render_moving, tmp_path, moves={})
 
 
 def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:
@@ -540,8 +534,8 @@ def test_objects_move_like_a_scene_that_is_built_there(tmp_path: Path) -> None:
 
 
 def test_tasks_that_cannot_be_sent_to_workers_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="more than one worker"):
-        render_sequence({**demo_scene(), "x": lambda: 0}, demo_cameras(1), tmp_path, workers=2, **TINY)
+    scene = {**demo_scene(), "x": lambda: 0}
+    assert "more than one worker" in refused(render_sequence, scene, demo_cameras(1), tmp_path, workers=2, **TINY)
 
 
 XML = """<scene version="3.0.0">
@@ -600,5 +594,4 @@ def test_kept_samples_have_the_color_for_their_mean(tmp_path: Path) -> None:
     again = {"spp": 3, "noise_seeds": 2, "reference_frames": [], **SCALAR}
     render_sequence(demo_scene(), cameras, tmp_path, keep_samples=True, **again)
     assert images(folder) == before
-    with pytest.raises(InputError, match=r"samples_kept True, .*None"):
-        render_sequence(demo_scene(), cameras, tmp_path, **again)
+    assert re.search(r"samples_kept True, .*None", refused(render_sequence, demo_scene(), cameras, tmp_path, **again))

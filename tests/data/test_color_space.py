@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence, read_exr, write_exr
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence
 from mcdenoise.metrics import smape_linear
 
@@ -35,8 +35,7 @@ def test_acescg_is_converted() -> None:
 
 @pytest.mark.parametrize("stored", ["wide", (0.64, 0.33), (0.3,) * 8, (0.0,) * 8, (float("nan"),) * 8], ids=str)
 def test_invalid_color_spaces(stored: Any) -> None:
-    with pytest.raises(InputError, match="'chromaticities':"):
-        to_rec709(torch.rand(1, 3, 2, 2), {"chromaticities": stored})
+    assert "'chromaticities':" in refused(to_rec709, torch.rand(1, 3, 2, 2), {"chromaticities": stored})
 
 
 def test_frames_of_acescg_are_denoised_in_it_and_come_back_in_it(

@@ -3,11 +3,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.files import atomic_path, write_text
 from mcdenoise.data.images import read_image_header
-from mcdenoise.errors import InputError
 
 RGB = ["R", "G", "B"]
 
@@ -49,8 +49,7 @@ def test_metadata_is_kept(tmp_path: Path, image: np.ndarray) -> None:
 def test_write_text_is_whole_or_not_at_all(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "eins, zwei, dreißig")
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "eins, zwei, dreißig"
-    with pytest.raises(InputError, match="cannot be written"):
-        write_text(tmp_path / "missing" / "a.txt", "x")
+    assert "cannot be written" in refused(write_text, tmp_path / "missing" / "a.txt", "x")
 
     def broken_off(error: BaseException) -> None:
         with atomic_path(tmp_path / "a.txt") as temporary:
@@ -59,15 +58,13 @@ def test_write_text_is_whole_or_not_at_all(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         broken_off(KeyboardInterrupt())
-    with pytest.raises(InputError, match="No space left"):
-        broken_off(OSError(errno.ENOSPC, "No space left on device"))
+    assert "No space left" in refused(broken_off, OSError(errno.ENOSPC, "No space left on device"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "eins, zwei, dreißig"
 
 
 def test_device_is_never_replaced() -> None:
-    with pytest.raises(InputError, match="a device"):
-        write_text(Path("/dev/null"), "x")
+    assert "a device" in refused(write_text, Path("/dev/null"), "x")
     assert not Path("/dev/null").is_file()
 
 

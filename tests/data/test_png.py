@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mcdenoise.data.png import read_png, write_png
-from mcdenoise.errors import InputError
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (90, 160)])
@@ -18,14 +18,11 @@ def test_written_files_are_read(tmp_path: Path, size: tuple[int, int]) -> None:
 
 def test_files_that_are_no_pictures(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    with pytest.raises(InputError, match=r"a\.png:"):
-        read_png(path)
+    assert "a.png:" in refused(read_png, path)
     write_png(path, np.random.default_rng(0).integers(0, 256, (30, 30, 3), dtype=np.uint8))
     whole = path.read_bytes()
     for length in (0, 20, len(whole) // 2, len(whole) - 20):
         path.write_bytes(whole[:length])
-        with pytest.raises(InputError, match=r"a\.png:") as error:
-            read_png(path)
-        assert "\n" not in str(error.value)
-    with pytest.raises(InputError, match=r"a\.png: cannot be written"):
-        write_png(tmp_path / "missing" / "a.png", np.zeros((2, 2, 3), np.uint8))
+        assert "a.png:" in refused(read_png, path)
+    nowhere = tmp_path / "missing" / "a.png"
+    assert "a.png: cannot be written" in refused(write_png, nowhere, np.zeros((2, 2, 3), np.uint8))

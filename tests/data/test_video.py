@@ -10,7 +10,6 @@ from refusals import full_disk, refused
 
 from mcdenoise.data.png import Picture
 from mcdenoise.data.video import write_video
-from mcdenoise.errors import InputError
 
 av = pytest.importorskip("av")
 
@@ -57,8 +56,7 @@ def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, [gradient(16, 16)] * 2)
     before = path.read_bytes()
-    with pytest.raises(InputError, match="expected pictures of"):
-        write_video(path, [gradient(16, 16), gradient(16, 18)])
+    assert "expected pictures of" in refused(write_video, path, [gradient(16, 16), gradient(16, 18)])
     with pytest.raises(ValueError, match="expected at least one picture"):
         write_video(path, [])
 
@@ -69,8 +67,7 @@ def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
         interrupted()
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(InputError, match="cannot be written"):
-        write_video(tmp_path / "missing" / "a.mp4", [gradient(16, 16)])
+    assert "cannot be written" in refused(write_video, tmp_path / "missing" / "a.mp4", [gradient(16, 16)])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the file size through the POSIX resource limit")

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from torch import Tensor
 from toys import frame_of
 
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated
 from mcdenoise.models.noisy import Noisy
@@ -106,8 +106,7 @@ def test_sources(pyoidn: Any) -> None:
 def test_says_that_it_has_no_derivatives(pyoidn: Any) -> None:
     given = frame()
     given.color.requires_grad_()
-    with pytest.raises(InputError, match="derivatives"):
-        Oidn(threads=1)(given)
+    assert "derivatives" in refused(Oidn(threads=1), given)
     with torch.no_grad():
         assert not Oidn(threads=1)(given)[0].image.requires_grad
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 
-from mcdenoise import Denoiser, Frame, InputError, create_model, list_models
+from mcdenoise import Denoiser, Frame, create_model, list_models
 from mcdenoise.models import _registry
 from mcdenoise.models._overview import overview, users_of
 from mcdenoise.models._registry import troubles
@@ -69,10 +70,9 @@ def install(site: Path, package: str, entry_points: str) -> Path:
 def test_a_broken_model_is_named_where_it_is_asked_for(site: Path) -> None:
     assert set(BROKEN) | {"vague"} <= set(list_models())
     for name, (_, reason) in {**BROKEN, "vague": ("", "")}.items():
-        with pytest.raises(InputError, match=f"'{name}'") as caught:
-            create_model(name)
-        assert reason in str(caught.value)
-        assert "\n" not in str(caught.value)
+        message = refused(create_model, name)
+        assert f"'{name}'" in message
+        assert reason in message
         (listed,) = overview(name)
         assert reason in listed.reason
 
@@ -82,10 +82,8 @@ def test_it_hinders_no_other(site: Path) -> None:
     assert torch.equal(Denoiser("noisy")(frame), frame.color)
     assert create_model("svgf").needs.buffers
     assert "kpcn" in users_of(["albedo"])["albedo"]
-    with pytest.raises(InputError, match="joint_bilateral"):
-        Denoiser(lambda color, albedo: color)(frame)
-    with pytest.raises(InputError, match="did you mean"):
-        create_model("svgff")
+    assert "joint_bilateral" in refused(Denoiser(lambda color, albedo: color), frame)
+    assert "did you mean" in refused(create_model, "svgff")
 
 
 def test_an_offer_that_cannot_be_read_is_listed(site: Path) -> None:

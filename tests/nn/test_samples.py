@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.light import LARGEST_RADIANCE
 from mcdenoise.nn.samples import LeakyUNet, samples_of
@@ -33,5 +33,4 @@ def test_samples_that_are_no_radiance() -> None:
     samples = torch.tensor([-1.0, 2.0, torch.inf, torch.nan, -torch.inf, 0.5]).reshape(1, 2, 3, 1, 1)
     found = samples_of(Frame(torch.ones(1, 3, 1, 1), samples=samples))
     assert found.flatten().tolist() == pytest.approx([0, 2, LARGEST_RADIANCE, 0, 0, 0.5])
-    with pytest.raises(InputError, match=r"buffer 'samples'"):
-        samples_of(Frame(torch.ones(1, 3, 1, 1), samples=samples[:, :, :2]))
+    assert "buffer 'samples'" in refused(samples_of, Frame(torch.ones(1, 3, 1, 1), samples=samples[:, :, :2]))

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import run
+from refusals import refused
 from small_benchmark import FRAMES, HOSTILE, save
 
-from mcdenoise.errors import InputError
 from mcdenoise.report import write_report
 from mcdenoise.report import writing as report_writing
 from mcdenoise.report.pictures import FORMATS
@@ -119,8 +119,7 @@ def test_more_pictures_are_coarser_and_then_smaller(folder: Path, monkeypatch: p
 def test_pictures_of_another_size(folder: Path, tmp_path: Path):
     copy = shutil.copytree(folder, tmp_path / "copy", ignore=shutil.ignore_patterns("plots", "index.html"))
     save(copy, "first", "ours", FRAMES[0], np.zeros((8, 8, 3), np.float32))
-    with pytest.raises(InputError, match=r"ours.3\.exr: .*3 channels of 8x8"):
-        report_writing._galleries(copy, Results.read(copy))
+    assert re.search(r"ours.3\.exr: .*3 channels of 8x8", refused(report_writing._galleries, copy, Results.read(copy)))
 
 
 @pytest.fixture
