@@ -1,7 +1,7 @@
 """The extension for Blender: it reads files as the package does, and its zip works in a Blender that is there."""
 
-import importlib.util
 import os
+import runpy
 import subprocess
 import sys
 import types
@@ -29,14 +29,7 @@ SHOTS = {"blender": "ViewLayer", "blender5": "ViewLayer"}
 
 @pytest.fixture(scope="module")
 def frames() -> Any:
-    return loaded(EXTENSION / "frames.py")
-
-
-def loaded(path: Path) -> types.ModuleType:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return types.SimpleNamespace(**runpy.run_path(str(EXTENSION / "frames.py")))
 
 
 @pytest.mark.parametrize("shot", SHOTS)

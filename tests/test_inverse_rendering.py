@@ -1,9 +1,8 @@
 """The example that renders with the denoiser in the loop, in its smallest form."""
 
-import importlib.util
-import sys
+import runpy
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import pytest
 
@@ -12,19 +11,9 @@ pytest.importorskip("mitsuba", reason="Mitsuba is not installed")
 PATH = Path(__file__).resolve().parents[1] / "examples" / "inverse_rendering.py"
 
 
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("inverse_rendering", PATH)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["inverse_rendering"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_descent_with_and_without_the_denoiser(
-    example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_descent_with_and_without_the_denoiser(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    example = SimpleNamespace(**runpy.run_path(str(PATH)))
     found = example.compare("scalar_rgb", size=16, steps=12, seeds=1, samples=64)
     for errors in found.values():
         assert len(errors) == 1

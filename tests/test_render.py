@@ -17,6 +17,7 @@ from refusals import refused
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
+from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
 from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
@@ -349,8 +350,8 @@ def test_a_reference_is_resumed_in_the_middle(tmp_path: Path, monkeypatch: pytes
     assert calls[-1] == (71, 71)
     (folder / "reference0.exr").unlink()
     (folder / "reference0.partial.npz").write_text("hello")
-    told = refused(render_sequence, demo_scene(), demo_cameras(1), folder.parent, **settings)
-    assert "reference0.partial.npz:" in told
+    with pytest.raises(InputError, match=r"reference0\.partial\.npz:"):
+        render_sequence(demo_scene(), demo_cameras(1), folder.parent, **settings)
 
 
 def test_refining_a_reference_continues_where_it_was(tmp_path: Path) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 import torch
-from planes import leaning_wall
+from planes import pixel_rays
+from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
+from mcdenoise.data.camera_path import Camera, view_projection
 from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_clean_features
 from mcdenoise.data.shards import write_shard
 from mcdenoise.frame import Frame
@@ -97,7 +99,7 @@ def build(folder: Path) -> None:
     (folder / "run_times.json").write_text(json.dumps({"a machine": 12.5}))
     (folder / "precision.json").write_text(json.dumps({"a machine": 1.5}))
     (folder / "clean").mkdir()
-    write_clean_features(folder / "clean", 0, *(torch.ones(1, 3, HEIGHT, WIDTH),) * 2)
+    write_clean_features(folder / "clean", 0, *(tensor(np.ones((WIDTH * HEIGHT, 3))),) * 2)
     halves = ReferenceHalves(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
     halves.add(np.full((WIDTH * HEIGHT, 3), 1.5), 4)
     halves.save(folder / "reference0.partial.npz")
@@ -121,14 +123,30 @@ def stop_a_training(folder: Path) -> None:
 
 def rendered() -> tuple[list[Frame], CameraMatrices]:
     """Noisy frames of a wall with a pattern, and their cameras."""
-    g, walls = torch.Generator().manual_seed(0), [leaning_wall(number, WIDTH, HEIGHT) for number in range(FRAMES)]
-    matrices, frames = torch.cat([wall.pop("view_projection") for wall in walls]).double().numpy(), []
-    for wall in walls:
-        noise = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=g).clamp_min(1e-6))
-        features = {name: wall[name] for name in ("albedo", "normal", "position")}
-        motion = torch.zeros(1, 2, HEIGHT, WIDTH)
-        frames.append(Frame(wall["albedo"] * noise, **features, motion=motion, reference=wall["albedo"]))
-    return frames, CameraMatrices(matrices, np.full((FRAMES, 2), 0.5))
+    g, frames, matrices = np.random.default_rng(0), [], []
+    for number in range(FRAMES):
+        camera = Camera.look_at((0.3 + 0.05 * number, 0.2, 4), (0, 0, 0), 40)
+        rays = pixel_rays(camera, WIDTH, HEIGHT)
+        position = rays.origin - rays.origin[2] / rays.directions[:, 2:] * rays.directions
+        matrices.append(view_projection(camera, WIDTH, HEIGHT, 0.01, 100))
+        checker = (np.floor(position[:, 0] * 2) + np.floor(position[:, 1] * 2)) % 2
+        albedo = np.where(checker[:, None] > 0, [0.8, 0.6, 0.4], [0.2, 0.3, 0.4])
+        reference = albedo * (1 + 0.5 * np.cos(position[:, :1]))
+        frame = Frame(
+            color=tensor(reference * g.exponential(size=reference.shape)),
+            albedo=tensor(albedo),
+            normal=tensor(np.broadcast_to([0.0, 0.0, 1.0], position.shape)),
+            position=tensor(position),
+            motion=tensor(np.zeros((WIDTH * HEIGHT, 2))),
+            reference=tensor(reference),
+        )
+        frames.append(frame)
+    return frames, CameraMatrices(np.stack(matrices), np.full((FRAMES, 2), 0.5))
+
+
+def tensor(values: np.ndarray) -> Tensor:
+    image = torch.from_numpy(np.ascontiguousarray(values)).float()
+    return image.reshape(HEIGHT, WIDTH, -1).permute(2, 0, 1)[None].contiguous()
 
 
 def write_layers(path: Path, frame: Frame) -> None:

@@ -296,14 +296,6 @@ def test_a_shortened_history_is_that_of_a_shorter_history(alpha_min: float, long
     assert seen.reset == ""
 
 
-def test_without_albedo_nothing_is_known_of_mirrors() -> None:
-    history = Shot()
-    motion = torch.full((1, 2, HEIGHT, WIDTH), 0.25)
-    for number in range(1, 6):
-        seen = history.update(Frame(color=torch.rand(1, 3, HEIGHT, WIDTH), motion=motion))
-        assert seen.length.max().item() == pytest.approx(number)
-
-
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_mirror_of_unknown_motion_starts_anew(value: float) -> None:
     history, motion = Shot(), torch.zeros(1, 2, HEIGHT, WIDTH)

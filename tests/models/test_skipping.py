@@ -134,12 +134,6 @@ def test_one_frame_and_the_last_one_are_not_remembered() -> None:
             assert (denoiser._state is not None) is keeps
 
 
-def test_a_clear_sky_has_no_noise_and_is_copied() -> None:
-    frame = sky(wall(0), 90)
-    free = noise_free(frame)
-    assert torch.equal(free, frame.depth == torch.inf)
-
-
 def test_noise_fog_and_detail_are_left_to_the_network() -> None:
     frame = sky(wall(0), 90)
     for strength in (0.05, 1.0):

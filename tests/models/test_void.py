@@ -211,16 +211,6 @@ def test_one_channel_is_grey(layout: mcdenoise.frame.Layout) -> None:
     np.testing.assert_array_equal(denoised(single), image.reshape(single.shape))
 
 
-def test_a_method_sees_no_mask() -> None:
-    class Seen(Same):
-        def forward(self, frame: Frame, state: object = None) -> object:
-            assert frame.mask is None
-            return super().forward(frame, state)
-
-    color, valid = charts()
-    assert torch.equal(Denoiser(Seen())(Frame(color, mask=valid)), color)
-
-
 class Own(Tensor):
     """A class of a user's own."""
 
