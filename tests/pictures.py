@@ -38,6 +38,11 @@ def save(path: Path, channels: Mapping[str, Any], kind: str | Sequence[str] = "f
     return path
 
 
+def as_channels(layers: Mapping[str, Any], letters: str = "RGB") -> dict[str, Any]:
+    """Channels ``(H, W)`` by the names that they have in a file with these images ``(H, W, C)`` as its layers."""
+    return {f"{name}.{c}".lstrip("."): image[..., i] for name, image in layers.items() for i, c in enumerate(letters)}
+
+
 def part_of(
     channels: Mapping[str, Any],
     name: str = "",

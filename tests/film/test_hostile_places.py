@@ -19,15 +19,6 @@ PACKAGE = Path(mcdenoise.__file__).parent
 NAMES = ["with space", "line\nbreak", "🎬 ünï", "[a]", "%s", "--ray", "\x1b[2J"]
 
 
-def film(
-    folder: Path, *arguments: object, environment: dict[str, str] | None = None
-) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mcdenoise", "film", *map(str, arguments), "--model", "accumulated"]
-    paths = [str(folder / "site"), str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]
-    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": ":".join(filter(None, paths)), **(environment or {})}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "environment",
@@ -36,7 +27,10 @@ def film(
 )
 def test_environments_without_much(environment: dict[str, str], tmp_path: Path) -> None:
     write_shot(tmp_path / "renders/ünï", 3)
-    ended = film(tmp_path, "renders/*", "-o", "out", environment=environment)
+    command = [sys.executable, "-m", "mcdenoise", "film", "renders/*", "-o", "out", "--model", "accumulated"]
+    path = ":".join([str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")]).strip(":")
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": path, **environment}
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert "Traceback" not in ended.stderr
     assert len(pixels(tmp_path / "out/ünï")) == 3

@@ -20,10 +20,8 @@ SECONDS = 240.0
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="processes are found in /proc")
 def test_a_killed_driver_takes_its_workers_along_and_the_next_goes_on(tmp_path: Path) -> None:
     shot = write_shot(tmp_path / "in", 60)
-    manifest, out = (
-        write_manifest(tmp_path / "film.toml", {"s": shot}, model="accumulated", threads=1),
-        tmp_path / "out",
-    )
+    manifest = write_manifest(tmp_path / "film.toml", {"s": shot}, model="accumulated", threads=1)
+    out = tmp_path / "out"
     command = [sys.executable, "-m", "mcdenoise", "film", str(manifest), "-o", str(out)]
     first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + SECONDS

@@ -23,8 +23,17 @@ PHASES: dict[str, Callable[[Path], bool]] = {
 }
 
 
-def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
-    tmp_path.mkdir(exist_ok=True)
+@pytest.mark.parametrize(
+    ("phase", "number"),
+    [
+        pytest.param("looking", signal.SIGHUP, marks=pytest.mark.slow),
+        ("first frame", signal.SIGINT),
+        pytest.param("middle", signal.SIGTERM, marks=pytest.mark.slow),
+        pytest.param("closing", signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+    ids=lambda each: getattr(each, "name", each),
+)
+def test_a_signal_ends_a_film_with_one_line(tmp_path: Path, phase: str, number: signal.Signals) -> None:
     shot = write_shot(tmp_path / "renders/s", FRAMES)
     manifest, out = write_manifest(tmp_path / "film.toml", {"s": shot}, model="accumulated"), tmp_path / "out"
     process = started(OBEYING, "film", manifest, "-o", out, "--workers", 2, folder=tmp_path)
@@ -39,17 +48,3 @@ def interrupt(tmp_path: Path, phase: str, number: signal.Signals) -> None:
     if phase == "middle":
         assert not json.loads((out / "film.json").read_text())["complete"]
     assert not [path for path in out.rglob("*") if path.name.startswith(".mcdenoise-")]
-
-
-@pytest.mark.parametrize(
-    ("phase", "number"),
-    [
-        pytest.param("looking", signal.SIGHUP, marks=pytest.mark.slow),
-        ("first frame", signal.SIGINT),
-        pytest.param("middle", signal.SIGTERM, marks=pytest.mark.slow),
-        pytest.param("closing", signal.SIGHUP, marks=pytest.mark.slow),
-    ],
-    ids=lambda each: getattr(each, "name", each),
-)
-def test_a_signal_ends_a_film_with_one_line(tmp_path: Path, phase: str, number: signal.Signals) -> None:
-    interrupt(tmp_path, phase, number)

@@ -1,7 +1,8 @@
 """Files to read: those of real renderers, and those with the names of others."""
 
-import importlib.util
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,4 @@ def rendered() -> Path:
 @pytest.fixture(scope="session")
 def others(rendered: Path) -> Any:
     """The script that writes files with the channel names of renderers which did not run here."""
-    spec = importlib.util.spec_from_file_location("others", rendered / "others.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(rendered / "others.py")))

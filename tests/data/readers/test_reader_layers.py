@@ -88,8 +88,9 @@ ROWS = [(renderer, *row) for renderer, rows in TABLE.items() for row in rows]
 @pytest.mark.parametrize(("renderer", "channels", "layer", "buffer"), ROWS, ids=[f"{r[0]}: {r[2]}" for r in ROWS])
 def test_the_names_of_every_renderer(renderer: str, channels: str, layer: str, buffer: str | None) -> None:
     # The layer is beside others, and so one of its own, unless the file holds nothing else.
-    layers = layers_of(0, "render", [part(channels if layer == "render.RGB" else f"{channels} other.R other.T")])
-    assert found(f"{channels} other.R other.T" if layer != "render.RGB" else channels).get(layer) == buffer
+    given = channels if layer == "render.RGB" else f"{channels} other.R other.T"
+    layers = layers_of(0, "render", [part(given)])
+    assert found(given).get(layer) == buffer
     assert sum(len(each.channels) for each in layers) >= len(channels.split())
 
 
@@ -153,8 +154,7 @@ def test_layers_that_cannot_be_requested(texts: list[str], expected: str, layere
 )
 def test_two_colors_are_refused_with_the_option_that_decides(channels: str, flags: list[str], tmp_path: Path) -> None:
     path = save(tmp_path / "a.exr", {name: np.ones(SIZE) for name in channels.split()})
-    message = refused(open_sequence, path)
-    assert f"--map {flags[0]}" in message
+    assert f"--map {flags[0]}" in refused(open_sequence, path)
     for flag in flags:
         assert open_sequence(path, mapping=[flag]).size == SIZE
 

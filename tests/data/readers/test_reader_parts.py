@@ -1,7 +1,6 @@
 """Diffuse and specular light from files: used where it adds up to the color, refused in words where it does not."""
 
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from commands import run
-from pictures import save
+from pictures import as_channels, save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
@@ -31,10 +30,6 @@ def drawn(seed: int) -> Image:
     return np.random.default_rng(seed).uniform(0.1, 2, (*SIZE, 3)).astype(np.float32)
 
 
-def three(name: str, image: Image, letters: str = "RGB") -> dict[str, Image]:
-    return {f"{name}.{letter}": image[..., i] for i, letter in enumerate(letters)}
-
-
 def blender(*without: str) -> tuple[dict[str, Image], dict[str, Image]]:
     """Channels of a file with Blender's passes but for some, and what each buffer is."""
     images, truth = {}, {}
@@ -52,10 +47,7 @@ def blender(*without: str) -> tuple[dict[str, Image], dict[str, Image]]:
     truth["color"] = truth["diffuse"] + truth["specular"]
     truth["specular_albedo"] = images["GlossCol"]
     layers = {"Combined": truth["color"], **images}
-    channels = {
-        f"View.{k}": v for name, image in layers.items() if name not in without for k, v in three(name, image).items()
-    }
-    return channels, truth
+    return as_channels({f"View.{name}": image for name, image in layers.items() if name not in without}), truth
 
 
 def image_of(frame: Frame, buffer: str) -> Image:
@@ -93,12 +85,13 @@ def test_missing_passes_are_named_and_no_part_is_used(tmp_path: Path, absent: li
 def test_a_color_that_has_been_denoised_is_not_the_sum(tmp_path: Path) -> None:
     channels, truth = blender()
     smooth = truth["color"].mean((0, 1), keepdims=True) + 0 * truth["color"]
-    sequence = open_sequence(save(tmp_path / "shot_0001.exr", {**channels, **three("View.Combined", smooth)}))
+    clean = channels | as_channels({"View.Combined": smooth})
+    sequence = open_sequence(save(tmp_path / "shot_0001.exr", clean))
     (warning,) = sequence.warnings
     assert "100.0% of the light" in warning
     assert warning.endswith("or the color has been denoised")
     # A color that is not denoised yet is the sum: it is preferred to the other.
-    both = {**channels, **three("View.Combined", smooth), **three("View.Noisy Image", truth["color"])}
+    both = clean | as_channels({"View.Noisy Image": truth["color"]})
     assert not open_sequence(save(tmp_path / "both_0001.exr", both)).warnings
 
 
@@ -111,15 +104,12 @@ def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, layout: str,
         (images[name] for name in ("diffuse", "specular", "emission") if name in images), 0 * drawn(0)
     )
     if layout == "layers":
-        channels = {k: v for name, each in images.items() if name != "color" for k, v in three(name, each).items()}
-        save(
-            tmp_path / "in" / "frame_0007.exr",
-            {**{each: images["color"][..., i] for i, each in enumerate("RGB")}, **channels},
-        )
+        channels = as_channels({"": images["color"]} | {k: v for k, v in images.items() if k != "color"})
+        save(tmp_path / "in" / "frame_0007.exr", channels)
     else:
         shot = "kitchen_" if layout == "files of a shot" else ""
         for name, image in images.items():
-            save(tmp_path / "in" / f"{shot}{name}_0007.exr", {letter: image[..., i] for i, letter in enumerate("RGB")})
+            save(tmp_path / "in" / f"{shot}{name}_0007.exr", as_channels({"": image}))
     sequence = open_sequence(tmp_path / "in")
     frame = sequence.frame(7)
     assert not sequence.warnings
@@ -132,7 +122,7 @@ def test_layers_named_diffuse_and_specular_are_used(tmp_path: Path, layout: str,
 def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path) -> None:
     channels, _ = blender()
     save(tmp_path / "shot_0001.exr", channels)
-    save(tmp_path / "shot_0002.exr", {**channels, **three("View.Emit", 5 * drawn(9))})
+    save(tmp_path / "shot_0002.exr", channels | as_channels({"View.Emit": 5 * drawn(9)}))
     sequence = open_sequence(tmp_path)
     assert sequence.frame(1).diffuse is not None
     with pytest.warns(UserWarning, match="frame 2: diffuse, specular do not add up"):
@@ -157,10 +147,6 @@ def shares(count: int, seed: int = 0) -> list[Any]:
     random = np.random.default_rng(seed)
     places = (random.random((count, 24, 32, 1)) < 0.7).repeat(2, 1).repeat(2, 2)
     return list((places * random.gamma(1, 1, (count, 48, 64, 3))).astype(np.float32))
-
-
-def as_channels(layers: Mapping[str, Any]) -> dict[str, Any]:
-    return {f"{name}.{c}".lstrip("."): image[..., i] for name, image in layers.items() for i, c in enumerate("RGB")}
 
 
 @pytest.mark.parametrize("kind", ["float", "half"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from commands import run
-from pictures import save
+from pictures import as_channels, save
 
 from mcdenoise.data import open_sequence, write_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
@@ -31,8 +31,7 @@ def picture(samples: Image) -> Image:
 
 
 def in_color(samples: Image) -> dict[str, Image]:
-    channels = {letter: picture(samples)[..., i] for i, letter in enumerate("RGB")}
-    return channels | {f"sample{k}.{c}": s[i] for k, s in enumerate(samples) for i, c in enumerate("RGB")}
+    return as_channels({"": picture(samples)} | {f"sample{k}": s.transpose(1, 2, 0) for k, s in enumerate(samples)})
 
 
 @pytest.mark.parametrize("kind", ["float", "half"])

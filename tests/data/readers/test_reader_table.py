@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pictures import channels_of
+from planes import seen_at
 
 from mcdenoise.data import open_sequence
 
@@ -29,17 +30,12 @@ def pixels(tensor: Any) -> Image:
 
 
 def projected(position: Image, matrix: Any) -> Image:
-    """Columns and rows of pixel centres at which a camera sees positions."""
-    clip = (
-        np.concatenate([position.astype(np.float64), np.ones_like(position[..., :1])], -1) @ matrix[0].double().numpy()
-    )
-    height, width = position.shape[:2]
-    result: Image = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
-    return result
+    """Columns and rows at which a camera sees positions."""
+    return np.stack(seen_at(position, matrix[0])[:2], -1)
 
 
 def center(position: Image) -> Image:
-    rows, columns = np.indices(position.shape[:2])
+    rows, columns = np.indices(position.shape[:2]) + 0.5
     return np.stack([columns, rows], -1)
 
 

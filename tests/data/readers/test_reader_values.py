@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.filters import gaussian_blur2d
-from pictures import save
+from pictures import as_channels, save
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.values import albedo_included, is_direction, normal_is_encoded, nothing_hit, read_radiance
@@ -124,9 +124,7 @@ def test_the_data_of_renderers_with_and_without_albedo(
     radiance, reflected = (image[0].permute(1, 2, 0).numpy() for image in (frame.color, frame.albedo))
     for divided in (False, True):
         stored = np.where(reflected > 0, radiance / np.maximum(reflected, 1e-6), 0) if divided else radiance
-        channels = dict(zip("RGB", np.moveaxis(stored, -1, 0), strict=True))
-        channels |= {f"albedo.{each}": reflected[..., i] for i, each in enumerate("RGB")}
-        path = save(tmp_path / str(divided) / "still.exr", channels)
+        path = save(tmp_path / str(divided) / "still.exr", as_channels({"": stored, "albedo": reflected}))
         opened = open_sequence(path)
         if folder == "mitsuba" and divided:
             # Matt checks far away, gold and glass: these 2304 pixels do not tell, and it is said what to do if so.
@@ -267,7 +265,7 @@ def test_a_moving_camera_under_an_infinite_sky(layout: str, others: Any, tmp_pat
             "motion": ("XY", np.where(hit[..., None], truth["motion"], np.inf)),
             "world_position": ("XYZ", np.where(hit[..., None], truth["position"], np.inf)),
         }
-        channels = {n: {each: image[..., i] for i, each in enumerate(names)} for n, (names, image) in buffers.items()}
+        channels = {name: as_channels({"": image}, letters) for name, (letters, image) in buffers.items()}
         if layout == "bmfr":
             for name, own in channels.items():
                 save(tmp_path / f"{name}{number}.exr", own)
@@ -291,8 +289,7 @@ def test_motion_in_files_is_told_by_the_frames(tmp_path: Path) -> None:
     """A shot of three frames that pans by 5 and 3 pixels, stored as current - previous in parts of the image."""
     for number in range(3):
         albedo = moving((-SHIFT[0] * number, -SHIFT[1] * number))[1]["albedo"]
-        channels = {name: albedo[..., i] for i, name in enumerate("RGB")}
-        channels |= {f"albedo.{name}": albedo[..., i] for i, name in enumerate("RGB")}
+        channels = as_channels({"": albedo, "albedo": albedo})
         channels |= {"mv.X": np.full((60, 100), -SHIFT[0] / 100), "mv.Y": np.full((60, 100), -SHIFT[1] / 60)}
         # Blender's name, and not what Blender writes.
         save(tmp_path / "parts" / f"a.{number}.exr", channels)
@@ -322,8 +319,7 @@ def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, tmp_path: Pa
     first: dict[str, Any] = {}
     for number in (1, 2, 3):
         truth = others.read(number)
-        channels = {name: truth["color"][..., i] for i, name in enumerate("RGB")}
-        channels |= {f"Position.{name}": truth["position"][..., i] for i, name in enumerate("XYZ")}
+        channels = as_channels({"": truth["color"]}) | as_channels({"Position": truth["position"]}, "XYZ")
         channels |= {f"Vector.{name}": np.zeros((36, 64)) for name in "XYZW"}
         channels["Depth.Z"] = truth["depth"]
         save(tmp_path / "moves" / f"a_{number}.exr", channels)
@@ -348,12 +344,9 @@ def test_a_shot_that_fades_in_is_read_by_a_frame_that_shows_something(black: int
     normal = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
     for number in range(4):
         seen = float(number >= black)
-        images = {"": light(number) * albedo * seen, "albedo.": albedo * seen, "N.": (normal / 2 + 0.5) * seen}
-        names = {"": "RGB", "albedo.": "RGB", "N.": "XYZ"}
-        save(
-            tmp_path / f"shot_{number}.exr",
-            {f"{layer}{c}": image[..., i] for layer, image in images.items() for i, c in enumerate(names[layer])},
-        )
+        channels = as_channels({"": light(number) * albedo * seen, "albedo": albedo * seen})
+        channels |= as_channels({"N": (normal / 2 + 0.5) * seen}, "XYZ")
+        save(tmp_path / f"shot_{number}.exr", channels)
     sequence = open_sequence(tmp_path)
     assert {row.buffer: row.reading for row in sequence.table}["normal"] == "stored as n/2 + 1/2, decoded"
     frame = sequence.frame(2)

@@ -7,10 +7,10 @@ import numpy as np
 import OpenEXR
 import pytest
 from pictures import part_of, stored
+from refusals import refused
 
 from mcdenoise import Denoiser
 from mcdenoise.data import open_sequence
-from mcdenoise.errors import InputError
 from mcdenoise.folder import denoise_sequence
 
 Image = np.ndarray[Any, Any]
@@ -97,5 +97,4 @@ def test_another_display_window_is_refused(cropped: Path) -> None:
     channels = radiance(20, 30, 0) | {"Z": np.ones((20, 30), np.float32)}
     other = part_of(channels, place=(4, 6), display=(80, 128))
     OpenEXR.File([other]).write(str(cropped / "shot_0001.exr"))
-    with pytest.raises(InputError, match=r"shot_0001\.exr"):
-        open_sequence(cropped)
+    assert "shot_0001.exr" in refused(open_sequence, cropped)
