@@ -39,8 +39,8 @@ def leaning_wall(number: int, width: int, height: int, step: float = 1.0) -> dic
     return features | {"depth": depth[None, None], "position": position[None], "view_projection": matrix}
 
 
-def random_shot(seed: int, height: int, width: int, frames: int) -> list[Frame]:
-    """Frames with random values in every buffer, that move by a motion of their seed."""
+def random_shot(seed: int, height: int = 80, width: int = 112, frames: int = 3) -> list[Frame]:
+    """Frames of random values, that move by a motion of their seed; by default large enough for compiled kernels."""
     g = torch.Generator().manual_seed(seed)
 
     def images(channels: int) -> Tensor:

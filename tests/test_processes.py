@@ -22,11 +22,6 @@ from mcdenoise import Denoiser, Frame, InputError, ops
 METHODS = ["svgf", "wild_small", "bmfr"]
 
 
-def shot(seed: int, height: int = 80, width: int = 112, frames: int = 3) -> list[Frame]:
-    """A few frames, large enough for compiled kernels. Each shot moves by itself, so that reports differ."""
-    return random_shot(seed, height, width, frames)
-
-
 def denoised(method: str, frames: list[Frame]) -> list[tuple[Tensor, Any]]:
     denoiser = Denoiser(method, precision="float32")
     found = []
@@ -52,7 +47,7 @@ def together(*actions: Callable[[], Any]) -> list[Any]:
 @pytest.mark.parametrize("pair", [(0, 0), (0, 1), (1, 2)], ids=lambda pair: "-".join(METHODS[i] for i in pair))
 def test_denoisers_in_two_threads_are_those_alone(pair: tuple[int, int]) -> None:
     # Of different sizes, for which different backends are the fastest.
-    tasks = [(METHODS[pair[0]], shot(1)), (METHODS[pair[1]], shot(2, 40, 48, frames=9))]
+    tasks = [(METHODS[pair[0]], random_shot(1)), (METHODS[pair[1]], random_shot(2, 40, 48, frames=9))]
     alone = [denoised(*task) for task in tasks]
     for found, expected in zip(together(*(lambda task=task: denoised(*task) for task in tasks)), alone, strict=True):
         for (image, report), (same, own) in zip(found, expected, strict=True):
@@ -62,7 +57,7 @@ def test_denoisers_in_two_threads_are_those_alone(pair: tuple[int, int]) -> None
 
 def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
     """As on a GPU, where values are read after the frame."""
-    good = shot(1)[0]
+    good = random_shot(1)[0]
     broken = good.replace(depth=torch.full_like(good.color[:, :1], torch.nan))
 
     def refused(frame: Frame) -> int:
@@ -81,7 +76,7 @@ def test_errors_that_are_told_late_are_those_of_the_own_frames() -> None:
 
 
 def test_one_denoiser_takes_the_frames_of_several_threads_in_turn() -> None:
-    denoiser, frame = Denoiser("svgf", precision="float32"), shot(1)[0]
+    denoiser, frame = Denoiser("svgf", precision="float32"), random_shot(1)[0]
     alone = [denoiser(frame) for _ in range(6)]
     denoiser.reset()
     found = [image for images in together(*[lambda: [denoiser(frame) for _ in range(3)]] * 2) for image in images]
@@ -93,15 +88,16 @@ def test_one_denoiser_takes_the_frames_of_several_threads_in_turn() -> None:
 IN_CHILDREN = """
 import multiprocessing, sys, torch
 sys.path.insert(0, {folder!r})
-from test_processes import denoised, shot
+from planes import random_shot
+from test_processes import denoised
 
 def child(method, connection):
-    connection.send([(image.numpy(), report) for image, report in denoised(method, shot(1))])
+    connection.send([(image.numpy(), report) for image, report in denoised(method, random_shot(1))])
 
 if __name__ == "__main__":
     torch.set_num_threads(2)
     for method in ("wild_small",):
-        expected = denoised(method, shot(1))
+        expected = denoised(method, random_shot(1))
         here, there = multiprocessing.Pipe()
         process = multiprocessing.get_context(sys.argv[1]).Process(target=child, args=(method, there))
         process.start()

@@ -8,6 +8,7 @@ import pytest
 import torch
 from kornia.filters import gaussian_blur2d
 from pictures import as_channels, save
+from test_correlated_noise import texture as checks
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.values import albedo_included, is_direction, normal_is_encoded, nothing_hit, read_radiance
@@ -18,14 +19,7 @@ HEIGHT, WIDTH = 96, 160
 
 
 def texture(kind: str) -> Image:
-    """Albedo of checks, in colors or in greys, or of one color everywhere."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    checks = ((rows // 5 + columns // 7) % 3)[..., None]
-    if kind == "colored":
-        return np.choose(checks, [[0.8, 0.3, 0.1], [0.2, 0.5, 0.6], [0.6, 0.6, 0.2]]).astype(np.float32)
-    if kind == "grey":
-        return np.choose(checks, [[0.8], [0.15], [0.4]]).repeat(3, -1).astype(np.float32)
-    return np.full((HEIGHT, WIDTH, 3), [0.6, 0.4, 0.3], np.float32)
+    return checks(kind)[0, :, :HEIGHT, :WIDTH].permute(1, 2, 0).numpy()
 
 
 def light(seed: int) -> Image:
@@ -96,7 +90,7 @@ def test_fog_and_glass_are_never_taken_for_light_without_albedo(kind: str, seen_
 
 @pytest.mark.parametrize("included", [True, False])
 def test_a_constant_albedo_does_not_decide_whether_it_is_included(included: bool) -> None:
-    albedo, irradiance = texture("one"), light(0)
+    albedo, irradiance = texture("plain"), light(0)
     color = albedo * irradiance if included else irradiance
     assert albedo_included(color, albedo).included is None
     assert read_radiance(color, albedo, None, None)[0] is True
