@@ -131,7 +131,7 @@ def test_the_same_seed_gives_the_same_pixels_and_a_stopped_run_is_resumed(
     def fail(*_: Any) -> None:
         raise AssertionError("nothing is missing")
 
-    for name in ("write_buffer", "write_noisy", "write_reference"):
+    for name in ("write_buffers", "write_reference"):
         monkeypatch.setattr(render_frames, name, fail)
     render("a")
     assert re.search(r"film .*'box'.*, .*None", refused(render, "a", film=None))

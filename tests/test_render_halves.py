@@ -1,12 +1,9 @@
 """Progressive references: halves, and the remaining noise."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from mcdenoise.errors import InputError
 from mcdenoise.metrics import smape_linear
 from mcdenoise.scenes.render.halves import ReferenceHalves
 
@@ -33,23 +30,3 @@ def test_noise_is_the_smape_against_the_truth(start: int) -> None:
     # Measured: within 1 %.
     np.testing.assert_allclose(noise, smape_linear(*images).item(), rtol=0.03)
     assert (halves.spp, halves.passes) == (start + 96, start + 6)
-
-
-def test_saved_and_loaded(tmp_path: Path) -> None:
-    halves = ReferenceHalves(np.zeros((PIXELS, 3)))
-    for mean in passes(3, 16):
-        halves.add(mean, 16)
-    path = tmp_path / "reference0.partial.npz"
-    halves.save(path)
-    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
-    found = ReferenceHalves.load(path, (PIXELS, 1))
-    assert (found.paths, found.passes, found.noise()) == (halves.paths, halves.passes, halves.noise())
-    np.testing.assert_array_equal(found.mean(), halves.mean())
-    with pytest.raises(InputError, match="unfinished"):
-        ReferenceHalves.load(path, (PIXELS, 2))
-    # The header of an array is read by Python's tokenizer, for which a bracket has to be closed.
-    unclosed = path.read_bytes().replace(b"{'descr'", b"{{{descr", 1)
-    for content in (path.read_bytes()[:-9], unclosed, b""):
-        path.write_bytes(content)
-        with pytest.raises(InputError, match="unfinished"):
-            ReferenceHalves.load(path, (PIXELS, 1))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from server import SECONDS
-from world import HEIGHT, MODEL, TRAINING, WIDTH
+from world import MODEL, TRAINING
 
 from mcdenoise.cli import COMMANDS as CLI
 from mcdenoise.cli import load_command, main
@@ -167,7 +167,6 @@ READ = {
     "run_times": "run_times run_times.json",
     "precision": "precision precision.json",
     "clean": "clean clean",
-    "halves": "halves reference0.partial.npz",
     "take": "take 0.take.npz",
 }
 for name, line in READ.items():
@@ -196,13 +195,6 @@ def read_run(path: Path) -> object:
     return run.errors()
 
 
-def read_halves(path: Path) -> object:
-    from mcdenoise.scenes.render.halves import ReferenceHalves
-
-    halves = ReferenceHalves.load(path, (WIDTH, HEIGHT))
-    return [halves.mean(), halves.noise(), halves.spp]
-
-
 READERS: dict[str, Callable[[Path], object]] = {
     "sequence": of("data", "open_sequence", lambda found: [dict(found.frame(n).items()) for n in found.numbers]),
     "camera_path": of("data.camera_path", "load_camera_path"),
@@ -213,7 +205,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "run_times": of("user_cache", "numbers_in"),
     "precision": of("user_cache", "numbers_in"),
     "clean": lambda path: read_clean_features(path, 0),
-    "halves": read_halves,
     "take": of(
         "data.shards",
         "open_shard",
@@ -336,7 +327,6 @@ KINDS = {
     "run_times.json": Kind("run_times.json", json.loads, ("reader run_times",)),
     "clean features": Kind("clean/clean/albedo0.exr", pixels, ("reader clean",)),
     "packed take": Kind("0.take.npz", entries, ("reader take",)),
-    "unfinished reference": Kind("reference0.partial.npz", exactly, ("reader halves",)),
 }
 
 

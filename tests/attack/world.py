@@ -15,12 +15,11 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Camera, view_projection
-from mcdenoise.data.readers.bmfr import write_bmfr_frame, write_clean_features
+from mcdenoise.data.readers.bmfr import CLEAN, write_bmfr_frame, write_buffers
 from mcdenoise.data.shards import write_shard
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model, save_weights
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
-from mcdenoise.scenes.render.halves import ReferenceHalves
 from mcdenoise.train import Progress, TrainConfig, train
 
 WIDTH, HEIGHT, FRAMES = 16, 12, 2
@@ -99,10 +98,8 @@ def build(folder: Path) -> None:
     (folder / "run_times.json").write_text(json.dumps({"a machine": 12.5}))
     (folder / "precision.json").write_text(json.dumps({"a machine": 1.5}))
     (folder / "clean").mkdir()
-    write_clean_features(folder / "clean", 0, *(tensor(np.ones((WIDTH * HEIGHT, 3))),) * 2)
-    halves = ReferenceHalves(np.ones((WIDTH * HEIGHT, 3)), 4, 1)
-    halves.add(np.full((WIDTH * HEIGHT, 3), 1.5), 4)
-    halves.save(folder / "reference0.partial.npz")
+    white = tensor(np.ones((WIDTH * HEIGHT, 3)))
+    write_buffers(folder / "clean" / CLEAN, 0, {"albedo": white, "normal": white})
     colors = np.stack([frame.color[0].numpy() for frame in frames])
     write_shard(folder / "0.take.npz", {"number": 0, "credits": []}, {"color": colors, "reference": colors[-1:]})
     stop_a_training(folder)

@@ -19,7 +19,7 @@ from torch import Tensor
 from mcdenoise.data.camera_matrices import MATRICES
 from mcdenoise.data.exr import LARGEST_HALF, read_exr, write_exr
 from mcdenoise.data.files import listed, make_folder, write_text
-from mcdenoise.data.images import Image, Mask, MetadataValue, read_image_header, read_picture
+from mcdenoise.data.images import Image, Mask, read_image_header, read_picture
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, LIGHT_PARTS, SPECULAR
 from mcdenoise.data.readers.files import RenderedFiles, as_tensor
 from mcdenoise.data.readers.names import FileGroup, find_files
@@ -52,6 +52,8 @@ _OWN_STEMS = {"shading_normal", "world_position"}
 _CHANNELS = {1: ["Y"], 2: ["X", "Y"], 3: ["R", "G", "B"]}
 _DESCRIPTION = "camera.json"
 _FULL_FLOAT = {"position", "previous_position"}
+# Subfolder of the features of references, ``clean/albedoN.exr`` and so on.
+CLEAN = "clean"
 
 # The file of each frame by buffer.
 Files = Mapping[str, Mapping[int, Path]]
@@ -256,26 +258,27 @@ def write_bmfr_frame(folder: Path, number: int, frame: Frame) -> None:
     if not (folder / _DESCRIPTION).exists():
         write_text(folder / _DESCRIPTION, json.dumps({"color_includes_albedo": True}) + "\n")
     buffers = dict(frame.items())
-    for name in _STEMS:
-        if name in buffers:
-            write_buffer(folder, number, name, buffers[name])
+    write_buffers(folder, number, {name: buffers[name] for name in _STEMS if name in buffers})
 
 
-def write_buffer(
-    folder: Path, number: int, name: str, buffer: Tensor, *, metadata: Mapping[str, MetadataValue] | None = None
-) -> None:
-    """Write one buffer of a frame atomically, like :func:`write_bmfr_frame`.
+def write_buffers(folder: Path, number: int, buffers: Mapping[str, Tensor]) -> None:
+    """Write some buffers of a frame, one after the other, each atomically, like :func:`write_bmfr_frame`.
 
     Args:
-        folder: folder to write to. It must exist.
+        folder: folder to write to; created if it does not exist.
         number: frame number.
-        name: name of the buffer, such as ``"reference"``.
-        buffer: ``(1, C, H, W)``; samples are ``(1, S, C, H, W)``.
-        metadata: attributes for the file.
+        buffers: ``(1, C, H, W)`` by the names of buffers; samples are ``(1, S, C, H, W)``.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: a file cannot be written.
     """
+    make_folder(folder)
+    for name, buffer in buffers.items():
+        write_buffer(folder, number, name, buffer)
+
+
+def write_buffer(folder: Path, number: int, name: str, buffer: Tensor) -> None:
+    """Write one buffer of a frame to a folder that exists, see :func:`write_buffers`."""
     if name == "samples":
         write_samples(folder / f"{_STEMS[name]}{number}.exr", buffer[0].detach().float().cpu().numpy())
         return
@@ -284,13 +287,11 @@ def write_buffer(
         image = np.where(np.isinf(image), 0, image)
     full_float = name in _FULL_FLOAT or (name == "depth" and bool(image.max() > LARGEST_HALF))
     path = folder / f"{_STEMS[name]}{number}.exr"
-    write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float, metadata=metadata)
+    write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float)
 
 
 def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> bool:
-    """Whether a complete file of a buffer exists: its pixels are read, once per process.
-
-    A file that is damaged, empty or of another size, for example after a power failure, does not count.
+    """Whether a complete file of a buffer exists, see :func:`is_whole`.
 
     Args:
         folder: folder of the file.
@@ -298,12 +299,24 @@ def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> b
         name: name of the buffer.
         size: expected width and height in pixels.
     """
-    path = folder / f"{_STEMS[name]}{number}.exr"
+    return is_whole(folder / f"{_STEMS[name]}{number}.exr", size, BUFFERS[name].channels)
+
+
+def is_whole(path: Path, size: tuple[int, int], channels: int) -> bool:
+    """Whether an image exists and is complete: its pixels are read, once per process.
+
+    A file that is damaged, empty or of another size, for example after a power failure, does not count.
+
+    Args:
+        path: the file.
+        size: expected width and height in pixels.
+        channels: expected number of channels.
+    """
     try:
         status = os.stat(path)
     except OSError:
         return False
-    return _is_whole(path, size, len(_CHANNELS[BUFFERS[name].channels]), status.st_mtime_ns, status.st_size)
+    return _is_whole(path, size, channels, status.st_mtime_ns, status.st_size)
 
 
 @cache
@@ -315,28 +328,8 @@ def _is_whole(path: Path, size: tuple[int, int], channels: int, *_: int) -> bool
     return part.window == (0, 0, *size[::-1]) and len(part.channels) == channels
 
 
-CLEAN = "clean"
-
-
-def write_clean_features(folder: Path, number: int, albedo: Tensor, normal: Tensor) -> None:
-    """Write the converged features of a reference: ``clean/albedoN.exr`` and so on.
-
-    Args:
-        folder: ``inputs`` of a sequence.
-        number: frame number.
-        albedo: ``(1, 3, H, W)`` in [0, 1].
-        normal: ``(1, 3, H, W)`` in [-1, 1].
-
-    Raises:
-        InputError: a file cannot be written.
-    """
-    make_folder(folder / CLEAN)
-    write_buffer(folder / CLEAN, number, "albedo", albedo)
-    write_buffer(folder / CLEAN, number, "normal", normal)
-
-
 def read_clean_features(folder: Path, number: int) -> tuple[Tensor, Tensor] | None:
-    """Read albedo and normal of :func:`write_clean_features`, ``(1, 3, H, W)`` each, or ``None``.
+    """Read albedo and normal without noise from the subfolder ``CLEAN``, ``(1, 3, H, W)`` each, or ``None``.
 
     Raises:
         InputError: a file is damaged.

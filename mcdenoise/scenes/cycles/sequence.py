@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, view_projection
 from mcdenoise.data.images import Image, read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_clean_features
+from mcdenoise.data.readers.bmfr import CLEAN, has_buffer, noise_seed_folder, write_buffers
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.files import SKY, as_tensor, far_points
 from mcdenoise.data.readers.layers import layers_of, read_files
@@ -28,7 +28,8 @@ from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
-from mcdenoise.scenes.render.folder import ReferenceState, SequenceFolder, write_noisy, write_reference
+from mcdenoise.scenes.render.folder import SequenceFolder, write_reference
+from mcdenoise.scenes.render.halves import ReferenceState
 from mcdenoise.scenes.render.sequence import check_lowest
 from mcdenoise.scenes.render.stage import to_previous
 from mcdenoise.scenes.takes.draw import Take
@@ -173,10 +174,10 @@ def render_cycles(
         for number, noise_seed in noisy:
             back = {index + 1: to_previous(moves[name], number) for index, name in enumerate(movers)}
             found = shot(number, samples, 1 + noise_seed if noise_seed else 0, back)
-            write_noisy(folder.path, number, noise_seed, found)
+            write_buffers(noise_seed_folder(folder.path, noise_seed), number, found)
         for number in clean:
             found = shot(number, clean_samples, _REFERENCE_STREAM, {})
-            write_clean_features(folder.path, number, found["albedo"], found["normal"])
+            write_buffers(folder.path / CLEAN, number, {name: found[name] for name in ("albedo", "normal")})
             state = ReferenceState(clean_samples, 1, None)
             write_reference(folder.path, number, found["color"], state)
             folder.note_reference(number, state)

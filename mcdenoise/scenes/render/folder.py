@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,13 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.camera_path import Array, Camera, view_projection
+from mcdenoise.data.exr import write_exr
 from mcdenoise.data.files import make_folder, write_json
 from mcdenoise.data.images import read_image_header
-from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer
+from mcdenoise.data.readers.bmfr import is_whole
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
+from mcdenoise.scenes.render.halves import ReferenceState
 from mcdenoise.scenes.render.loading import Scene, scene_digest, scene_name
 
 _ADVICE = "choose another output folder, or delete this one"
@@ -77,21 +78,6 @@ _POSES = ("camera_to_world", "camera_matrices")
 _PER_FRAME = ("frames", *_POSES, "world_to_clip", "pixel_offsets", "moves")
 
 
-@dataclass(frozen=True)
-class ReferenceState:
-    """Progress of a reference on disk.
-
-    Args:
-        spp: paths per pixel.
-        passes: number of passes so far, which is also the seed number of the next pass.
-        noise: its estimated SMAPE against the truth; ``None`` if unknown.
-    """
-
-    spp: int
-    passes: int
-    noise: float | None
-
-
 class SequenceFolder:
     """The folder ``out/inputs`` with its camera files, ``camera.json`` among them.
 
@@ -144,7 +130,8 @@ class SequenceFolder:
         }
         before = self._read(described) if self._description.is_file() else {}
         self._settings = {**_merged(before, described), **_ALWAYS, **conventions}
-        self.references = self._find_references()
+        states = {n: reference_state(reference_file(self.path, n), size) for n in range(self._settings["frames"])}
+        self.references = {number: state for number, state in states.items() if state is not None}
         self._write()
         header = CameraMatrices(*(np.array(self._settings[name]) for name in ("camera_matrices", "pixel_offsets")))
         limits = {name: self._settings[name] for name in ("position_limit_squared", "normal_limit_squared")}
@@ -188,21 +175,6 @@ class SequenceFolder:
                     )
         return before
 
-    def _find_references(self) -> dict[int, ReferenceState]:
-        """Read the states of references from their headers, which are written together with the pixels."""
-        found: dict[int, ReferenceState] = {}
-        for number in range(self._settings["frames"]):
-            path = self.path / f"reference{number}.exr"
-            # A damaged reference is rendered again, like any other damaged file.
-            if not has_buffer(self.path, number, "reference", (self._settings["width"], self._settings["height"])):
-                continue
-            header = read_image_header(path).metadata
-            spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
-            if not isinstance(spp, int) or not isinstance(passes, int):
-                raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
-            found[number] = ReferenceState(spp, passes, noise if isinstance(noise, float) else None)
-        return found
-
     def _write(self) -> None:
         states = sorted(self.references.items())
         spp = {str(number): state.spp for number, state in states}
@@ -211,39 +183,44 @@ class SequenceFolder:
         write_json(self._description, content)
 
 
-def write_reference(folder: Path, number: int, image: Tensor, state: ReferenceState) -> None:
-    """Write ``referenceN.exr`` with its progress in the header, so that both always match.
+def reference_file(folder: Path, number: int, *, unfinished: bool = False) -> Path:
+    """The file of a reference, or of what there is of one that is being rendered, which no reader finds."""
+    return folder / f"{'.' if unfinished else ''}reference{number}.exr"
+
+
+def reference_state(path: Path, size: tuple[int, int]) -> ReferenceState | None:
+    """The progress of a reference, from its header; ``None`` without one, or if it is damaged like any other file.
+
+    Raises:
+        InputError: its header does not say how many paths it has.
+    """
+    if not is_whole(path, size, 3):
+        return None
+    header = read_image_header(path).metadata
+    spp, passes, noise = (header.get(f"reference_{name}") for name in ("spp", "passes", "noise"))
+    if not isinstance(spp, int) or not isinstance(passes, int):
+        raise InputError(f"{path}: expected a header that says how many paths it has, found none; remove it")
+    return ReferenceState(spp, passes, noise if isinstance(noise, float) else None)
+
+
+def write_reference(
+    folder: Path, number: int, image: Tensor, state: ReferenceState, *, unfinished: bool = False
+) -> None:
+    """Write a reference with its progress in the header, so that both always match.
 
     Args:
         folder: ``inputs`` of a sequence.
         number: frame number.
         image: ``(1, 3, H, W)``.
         state: progress of the reference.
+        unfinished: whether it is to be resumed: then it is stored as 32-bit floats, see :func:`reference_file`.
 
     Raises:
         InputError: the file cannot be written.
     """
-    noise = {} if state.noise is None else {"reference_noise": state.noise}
-    header = {"reference_spp": state.spp, "reference_passes": state.passes, **noise}
-    write_buffer(folder, number, "reference", image, metadata=header)
-
-
-def write_noisy(folder: Path, number: int, noise_seed: int, buffers: Mapping[str, Tensor]) -> None:
-    """Write the buffers of one noise seed: its noisy color, and possibly features.
-
-    Args:
-        folder: ``inputs`` of a sequence.
-        number: frame number.
-        noise_seed: index of the noise seed.
-        buffers: ``(1, C, H, W)`` by name, in the order of writing.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
-    place = noise_seed_folder(folder, noise_seed)
-    make_folder(place)
-    for name, buffer in buffers.items():
-        write_buffer(place, number, name, buffer)
+    header = {f"reference_{name}": value for name, value in vars(state).items() if value is not None}
+    path, pixels = reference_file(folder, number, unfinished=unfinished), image[0].permute(1, 2, 0).numpy()
+    write_exr(path, pixels, ["R", "G", "B"], full_float=unfinished, metadata=header)
 
 
 def _merged(before: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:

@@ -13,13 +13,13 @@ import torch
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.data.exr import read_exr
-from mcdenoise.data.readers.bmfr import has_buffer, noise_seed_folder, write_buffer, write_clean_features
+from mcdenoise.data.readers.bmfr import CLEAN, has_buffer, noise_seed_folder, write_buffers
 from mcdenoise.data.readers.files import as_tensor
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import ReferenceState, write_noisy, write_reference
-from mcdenoise.scenes.render.halves import ReferenceHalves
+from mcdenoise.scenes.render.folder import reference_file, reference_state, write_reference
+from mcdenoise.scenes.render.halves import ReferenceHalves, ReferenceState
 
 # With fewer paths, rare bright ones have not been hit yet, and the noise is underestimated.
 _FEWEST_PATHS_IN_A_HALF = 16
@@ -125,19 +125,19 @@ def render_frame(
         Progress of its reference; ``None`` if nothing was done for it.
 
     Raises:
-        InputError: a file cannot be written, or the unfinished reference is damaged.
+        InputError: a file cannot be written.
     """
     tracer.place(number)
     if job.film is None and not job.has(number, 0, job.features):
         found = tracer.features(number)
-        for name in job.features:
-            write_buffer(job.folder, number, name, _image(found[name], job.size))
+        write_buffers(job.folder, number, {name: _image(found[name], job.size) for name in job.features})
     state = None
     if job.wants_reference(number):
         state = _refine_reference(job, tracer, number, advance)
         if job.film is not None:
             clean = tracer.frame(number, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
-            write_clean_features(job.folder, number, *(_image(clean[name], job.size) for name in ("albedo", "normal")))
+            images = {name: _image(clean[name], job.size) for name in ("albedo", "normal")}
+            write_buffers(job.folder / CLEAN, number, images)
     for noise_seed in reversed(range(job.noise_seeds)):
         if not job.has(number, noise_seed, job.noisy):
             _render_noisy(job, tracer, number, noise_seed, advance)
@@ -164,23 +164,21 @@ def _render_noisy(
         advance(paths)
     # The color is written last.
     images = {name: _image(total[name] / job.spp, job.size) for name in sorted(total, key="color".__eq__)}
-    write_noisy(job.folder, number, noise_seed, ({"samples": torch.stack(kept, 1)} if kept else {}) | images)
+    folder = noise_seed_folder(job.folder, noise_seed)
+    write_buffers(folder, number, ({"samples": torch.stack(kept, 1)} if kept else {}) | images)
 
 
 def _refine_reference(
     job: FrameJob, tracer: SequenceTracer, number: int, advance: Callable[[int], None]
 ) -> ReferenceState:
     """Add passes to a reference until it is finished, and write it."""
-    unfinished = job.folder / f"reference{number}.partial.npz"
-    before = job.started.get(number, ReferenceState(0, 0, None))
-    if unfinished.is_file():
-        halves = ReferenceHalves.load(unfinished, job.size)
-        advance(halves.spp - before.spp)
-    else:
-        mean = np.zeros((job.size[0] * job.size[1], 3))
-        if before.spp:
-            mean += read_exr(job.folder / f"reference{number}.exr")[0].reshape(mean.shape)
-        halves = ReferenceHalves(mean, before.spp, before.passes)
+    halves = ReferenceHalves(np.zeros((job.size[0] * job.size[1], 3)))
+    for unfinished in (True, False):
+        path = reference_file(job.folder, number, unfinished=unfinished)
+        if (before := reference_state(path, job.size)) is not None:
+            halves = ReferenceHalves(read_exr(path)[0].reshape(-1, 3).astype(np.float64), before.spp, before.passes)
+            break
+    advance(halves.spp - (job.started[number].spp if number in job.started else 0))
     saved = time.monotonic()
     while not job.is_good(halves.spp, _reliable_noise(halves)):
         missing = job.reference_spp - halves.spp
@@ -192,13 +190,12 @@ def _refine_reference(
         halves.add(tracer.radiance(number, paths, seed, stratified=stratified), paths)
         advance(paths)
         if time.monotonic() - saved > _SECONDS_BETWEEN_SAVES:
-            halves.save(unfinished)
+            write_reference(job.folder, number, _image(halves.mean(), job.size), halves.state, unfinished=True)
             saved = time.monotonic()
     advance(max(0, job.reference_spp - halves.spp))
-    state = ReferenceState(halves.spp, halves.passes, halves.noise())
-    write_reference(job.folder, number, _image(halves.mean(), job.size), state)
-    unfinished.unlink(missing_ok=True)
-    return state
+    write_reference(job.folder, number, _image(halves.mean(), job.size), halves.state)
+    reference_file(job.folder, number, unfinished=True).unlink(missing_ok=True)
+    return halves.state
 
 
 def _reliable_noise(halves: ReferenceHalves) -> float | None:

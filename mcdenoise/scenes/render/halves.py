@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.data.files import atomic_path
-from mcdenoise.errors import InputError
-from mcdenoise.reading import read_bytes
 
 NOISE_EPSILON = 0.01
-_LARGEST = 1 << 34  # bytes
+
+
+@dataclass(frozen=True)
+class ReferenceState:
+    """Progress of a reference on disk.
+
+    Args:
+        spp: paths per pixel.
+        passes: number of passes so far, which is also the seed number of the next pass.
+        noise: its estimated SMAPE against the truth; ``None`` if unknown.
+    """
+
+    spp: int
+    passes: int
+    noise: float | None
 
 
 class ReferenceHalves:
@@ -42,43 +51,15 @@ class ReferenceHalves:
         # Paths per pixel of each half.
         self.paths, self.passes = (spp, 0), passes
 
-    @classmethod
-    def load(cls, path: Path, size: tuple[int, int]) -> ReferenceHalves:
-        """Read a file written by :meth:`save`.
-
-        Args:
-            path: the file.
-            size: width and height in pixels.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        try:
-            content = read_bytes(path, _LARGEST)
-            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-                first, second, passes = (int(number) for number in stored["counts"])
-                sums: NDArray[np.float64] = stored["sums"]
-            if sums.shape != (2, size[0] * size[1], 3) or sums.dtype != np.float64 or min(first, second, passes) < 0:
-                raise ValueError("other counts, or pixels of another image")
-        except Exception as error:  # of zipfile, zlib, numpy, and of Python's tokenizer, which reads numpy's headers
-            raise InputError(f"{path}: expected an unfinished reference, found something else; remove it") from error
-        halves = cls(sums[0], passes=passes)
-        halves._sums, halves.paths = sums, (first, second)
-        return halves
-
-    def save(self, path: Path) -> None:
-        """Write the state atomically.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        with atomic_path(path) as temporary:
-            np.savez(temporary, sums=self._sums, counts=np.array([*self.paths, self.passes]))
-
     @property
     def spp(self) -> int:
         """Paths per pixel of both halves together."""
         return sum(self.paths)
+
+    @property
+    def state(self) -> ReferenceState:
+        """Progress, for the header of the file."""
+        return ReferenceState(self.spp, self.passes, self.noise())
 
     def add(self, mean: Array, paths: int) -> None:
         """Add a pass, ``(N, 3)`` mean radiance of ``paths`` paths, to the half with fewer paths."""

@@ -20,8 +20,9 @@ from mcdenoise.engines import Engine, LocalEngine, run_each
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.render.features import RR_DEPTH, STRATIFIED_PATHS, SequenceTracer
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, ReferenceState, SequenceFolder
+from mcdenoise.scenes.render.folder import BY_MITSUBA, ON_A_FILM, SequenceFolder
 from mcdenoise.scenes.render.frames import FrameJob, render_frame, render_frame_task
+from mcdenoise.scenes.render.halves import ReferenceState
 from mcdenoise.scenes.render.loading import Scene, choose_variant
 
 _LARGEST_SIDE = 16384
@@ -54,7 +55,7 @@ def render_sequence(
     Existing files are kept, so an interrupted run can be resumed, and noise seeds, frames and better references can be
     added later: a reference with fewer paths or more noise than requested is refined by further passes with other
     seeds, starting from the half floats of its file, whose rounding error (0.02 %) is far below its noise. An
-    unfinished reference is saved once a minute, as ``referenceN.partial.npz``.
+    unfinished reference is saved once a minute, as the hidden ``.referenceN.exr``.
 
     Args:
         scene: a Mitsuba ``scene.xml``, or a Mitsuba dictionary. In a dictionary, numpy arrays may stand for transforms
