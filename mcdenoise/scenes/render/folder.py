@@ -74,8 +74,7 @@ _IDENTITY = (
     "seed",
 )
 # Entries with one value per frame: two runs are compared by the common frames, and the longer run adds the others.
-_POSES = ("camera_to_world", "camera_matrices")
-_PER_FRAME = ("frames", *_POSES, "world_to_clip", "pixel_offsets", "moves")
+_PER_FRAME = ("frames", "camera_to_world", "camera_matrices", "world_to_clip", "pixel_offsets", "moves")
 
 
 class SequenceFolder:
@@ -152,27 +151,23 @@ class SequenceFolder:
         described = self._description
         try:
             before: dict[str, Any] = json.loads(read_text(described))
-            moves = {identity: list(path) for identity, path in before.get("moves", {}).items()}
-            common = min(int(before["frames"]), settings["frames"])
-            paths = {key: [before[key][number] for number in range(common)] for key in _POSES}
-        except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+            # What is where in each frame; the camera has no name.
+            found, wanted = ({"": each["camera_matrices"], **each.get("moves", {})} for each in (before, settings))
+            common, both = range(min(int(before["frames"]), settings["frames"])), found.keys() & wanted.keys()
+            moved = [(each, name) for each in common for name in both if found[name][each] != wanted[name][each]]
+        except (OSError, ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
             if before.get(key) != settings.get(key):
-                found = f"rendered with {key} {before.get(key)}, now {settings.get(key)}"
-                raise InputError(f"{described}: {found}; {_ADVICE}")
-        now = settings.get("moves", {})
-        if moves.keys() != now.keys():
-            names = (", ".join(sorted(ids)) or "nothing" for ids in (moves, now))
+                now = f"rendered with {key} {before.get(key)}, now {settings.get(key)}"
+                raise InputError(f"{described}: {now}; {_ADVICE}")
+        if found.keys() != wanted.keys():
+            names = (", ".join(filter(None, sorted(each))) or "nothing" for each in (found, wanted))
             raise InputError(f"{described}: rendered with {next(names)} moving, now {next(names)}; {_ADVICE}")
-        for number in range(common):
-            if any(path[number] != settings[key][number] for key, path in paths.items()):
-                raise InputError(f"{described}: frame {number} was rendered from another camera; {_ADVICE}")
-            for identity, path in moves.items():
-                if path[number : number + 1] != now[identity][number : number + 1]:
-                    raise InputError(
-                        f"{described}: object '{identity}' was elsewhere when frame {number} was rendered; {_ADVICE}"
-                    )
+        if moved:
+            number, name = moved[0]
+            what = f"object '{name}'" if name else "the camera"
+            raise InputError(f"{described}: {what} was elsewhere when frame {number} was rendered; {_ADVICE}")
         return before
 
     def _write(self) -> None:

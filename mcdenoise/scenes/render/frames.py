@@ -38,7 +38,6 @@ class FrameJob:
     Args:
         load: makes the tracer of the scene.
         folder: ``inputs`` of the sequence.
-        frames: how many are rendered.
         references: frames that get a reference.
         started: progress of the references on disk.
     """
@@ -48,7 +47,6 @@ class FrameJob:
     size: tuple[int, int]
     film: Film | None
     folder: Path
-    frames: int
     spp: int
     noise_seeds: int
     reference_spp: int
@@ -91,13 +89,11 @@ class FrameJob:
         quiet = self.noise_level is not None and noise is not None and noise <= self.noise_level
         return spp >= self.reference_spp or quiet
 
-    def paths_there(self) -> int:
-        """Number of paths per pixel that are already on disk, summed over all frames."""
-        colors = sum(self.has(n, k, ("color",)) for n in range(self.frames) for k in range(self.noise_seeds))
-        states = [(number, self.started[number]) for number in self.references if number in self.started]
-        return colors * self.spp + sum(
-            state.spp if self.wants_reference(number) else self.reference_spp for number, state in states
-        )
+    def paths_left(self, number: int) -> int:
+        """Number of paths per pixel that a frame lacks."""
+        colors = sum(not self.has(number, noise_seed, self.noisy) for noise_seed in range(self.noise_seeds))
+        there = self.started[number].spp if number in self.started else 0
+        return colors * self.spp + (self.reference_spp - there if self.wants_reference(number) else 0)
 
 
 def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:

@@ -147,7 +147,6 @@ def render_sequence(
         size=size,
         film=film,
         folder=folder.path,
-        frames=count,
         spp=spp,
         noise_seeds=noise_seeds,
         reference_spp=reference_spp,
@@ -158,7 +157,9 @@ def render_sequence(
         started=dict(folder.references),
     )
 
-    done, total = 0, count * noise_seeds * spp + len(references) * reference_spp
+    total = count * noise_seeds * spp + len(references) * reference_spp
+    left = [job.paths_left(number) for number in range(count)]
+    done = total - sum(left)
 
     def advance(paths: int) -> None:
         nonlocal done
@@ -166,16 +167,15 @@ def render_sequence(
         if progress is not None:
             progress(min(done, total), total)
 
-    advance(job.paths_there())
+    advance(0)
     missing = [number for number in range(count) if not job.is_finished(number)]
     if engine is None:
         for number in missing:
             folder.note_reference(number, render_frame(job, tracer, number, advance))
         return folder.path
-    paths_per_frame = (total - done) // max(len(missing), 1)
 
     def finish(call: tuple[FrameJob, int], state: ReferenceState | None) -> None:
-        advance(paths_per_frame)
+        advance(left[call[1]])
         folder.note_reference(call[1], state)
 
     failed = run_each(engine, render_frame_task, [(job, number) for number in missing], finish)
