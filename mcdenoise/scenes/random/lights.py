@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, plate, rgb, rod, rotate, sheet
+from mcdenoise.scenes.random.builder import Part, SceneBuilder, Vector, ball, box, drum, plate, rgb, rod, rotate, sheet
 from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaque
 from mcdenoise.scenes.random.textures import Color, Rng
 
@@ -140,12 +140,12 @@ def add_spot(
 ) -> None:
     """A spot light directed at a target, or a point light."""
     if not narrow:
-        intensity = _scaled(color, power / (4 * math.pi))
+        intensity = scaled(color, power / (4 * math.pi))
         builder.add_light({"type": "point", "position": origin.tolist(), "intensity": rgb(intensity)})
         return
     cutoff = float(rng.uniform(15, 55))
     solid = 2 * math.pi * (1 - math.cos(math.radians(cutoff)))
-    intensity = _scaled(color, power / solid * 0.5)
+    intensity = scaled(color, power / solid * 0.5)
     pose = _facing(origin, target, (0.0, 0.0, 1.0))
     builder.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
 
@@ -155,10 +155,10 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     color, size = light_color(rng), float(np.exp(rng.uniform(math.log(0.03), math.log(0.6))))
     black = builder.material(diffuse((0.02, 0.02, 0.02)))
     if rng.random() < 0.4:
-        builder.add([ball(origin, size / 2, black, _scaled(color, power / (math.pi**2 * size**2)))])
+        builder.add([ball(origin, size / 2, black, scaled(color, power / (math.pi**2 * size**2)))])
         return
     half_size = (size, size * float(rng.uniform(0.3, 1)))
-    radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
+    radiance = scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
     builder.add([sheet(origin, half_size, black, _facing(origin, target, (0.0, 1.0, 0.0)), radiance)])
 
 
@@ -177,7 +177,7 @@ def _glowing(
 ) -> dict[str, str]:
     """Add a white sheet that sends out a power, and return its material."""
     white = builder.material(diffuse((0.8, 0.8, 0.8)))
-    radiance = _scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
+    radiance = scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
     builder.add([sheet(center, half_size, white, rotate("x", degrees), radiance)])
     return white
 
@@ -195,7 +195,7 @@ def _pendant(builder: SceneBuilder, rng: Rng, hook: Point, height: float, power:
     center = (hook[0], y, hook[2])
     cord = builder.material(diffuse((0.05, 0.05, 0.05)))
     builder.add([rod((hook[0], y + radius, hook[2]), hook, 0.006, cord)])
-    builder.add([_bulb(center, radius, cord, power, color)])
+    builder.add([bulb(center, radius, cord, power, color)])
     builder.points.append(np.array(center))
     if rng.random() < 0.4:
         shade = builder.material(random_opaque(rng))
@@ -210,7 +210,7 @@ def _standing(builder: SceneBuilder, rng: Rng, foot: Point, height: float, power
     top = float(rng.uniform(0.35, 0.7)) * height
     radius = float(rng.uniform(0.04, 0.15))
     builder.add([*drum(foot, 0.03, 0.15, metal), rod((x, y, z), (x, y + top - radius, z), 0.015, metal)])
-    builder.add([_bulb((x, y + top, z), radius, metal, power, color)])
+    builder.add([bulb((x, y + top, z), radius, metal, power, color)])
     builder.points.append(np.array((x, y + top, z)))
     if rng.random() < 0.5:
         shade = builder.material(random_opaque(rng))
@@ -239,13 +239,15 @@ def _chandelier(builder: SceneBuilder, rng: Rng, hook: Point, power: float, colo
         angle = 2 * math.pi * number / bulbs
         end = (hook[0] + radius * math.cos(angle), y + 0.08, hook[2] + radius * math.sin(angle))
         builder.add([rod((hook[0], y, hook[2]), end, 0.01, metal)])
-        builder.add([_bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
+        builder.add([bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
     builder.points.append(np.array((hook[0], y, hook[2])))
 
 
-def _bulb(center: Point, radius: float, material: dict[str, str], power: float, color: Color) -> Part:
-    return ball(center, radius, material, _scaled(color, power / (4 * math.pi**2 * radius**2)))
+def bulb(center: Vector, radius: float, material: dict[str, str], power: float, color: Color) -> Part:
+    """A ball that sends out a power."""
+    return ball(center, radius, material, scaled(color, power / (4 * math.pi**2 * radius**2)))
 
 
-def _scaled(color: Color, factor: float) -> Color:
+def scaled(color: Color, factor: float) -> Color:
+    """A color of another brightness."""
     return color[0] * factor, color[1] * factor, color[2] * factor

@@ -23,26 +23,26 @@ METALS = {
 
 def diffuse(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
     """A diffuse surface."""
-    return _two_sided({"type": "diffuse", "reflectance": _bitmap(reflectance, repeat)})
+    return _two_sided({"type": "diffuse", "reflectance": bitmap(reflectance, repeat)})
 
 
 def lacquer(reflectance: Color | Array, repeat: tuple[float, float] = (1, 1), nonlinear: bool | None = None) -> Bsdf:
     """A diffuse surface under a smooth clear coat; ``nonlinear`` saturates the color by internal reflections."""
-    inner = {"type": "plastic", "diffuse_reflectance": _bitmap(reflectance, repeat)}
+    inner = {"type": "plastic", "diffuse_reflectance": bitmap(reflectance, repeat)}
     # By default Mitsuba's plastic is linear; a key would change the checksums of scenes.
     return _two_sided(inner if nonlinear is None else {**inner, "nonlinear": nonlinear})
 
 
 def rough_plastic(reflectance: Color | Array, alpha: float, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
     """A diffuse surface under a rough coat."""
-    return _two_sided({"type": "roughplastic", "diffuse_reflectance": _bitmap(reflectance, repeat), "alpha": alpha})
+    return _two_sided({"type": "roughplastic", "diffuse_reflectance": bitmap(reflectance, repeat), "alpha": alpha})
 
 
 def rough_metal(material: str, alpha: float | Array, tint: Color | Array = (1, 1, 1)) -> Bsdf:
     """A rough metal; ``alpha`` may be a ``(H, W, 1)`` texture."""
     roughness = np.full((2, 2, 1), alpha) if isinstance(alpha, float) else alpha
-    rough = {"type": "roughconductor", "material": material, "alpha": _bitmap(roughness)}
-    return _two_sided({**rough, "specular_reflectance": _bitmap(tint)})
+    rough = {"type": "roughconductor", "material": material, "alpha": bitmap(roughness)}
+    return _two_sided({**rough, "specular_reflectance": bitmap(tint)})
 
 
 def mirror(material: str = "Ag") -> Bsdf:
@@ -63,7 +63,7 @@ def pane() -> Bsdf:
 def foliage(rng: Rng, color: Color) -> Bsdf:
     """A twig of leaves, cut out of a rectangle by a mask."""
     shade = np.clip(np.array(color) * rng.uniform(0.6, 1.4, (16, 16, 1)), 0.02, 0.9)
-    return {"type": "mask", "opacity": _bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
+    return {"type": "mask", "opacity": bitmap(leaf_mask(rng)), "bsdf": diffuse(shade)}
 
 
 def random_metal(rng: Rng) -> Bsdf:
@@ -104,7 +104,8 @@ def _two_sided(bsdf: Bsdf) -> Bsdf:
     return {"type": "twosided", "bsdf": bsdf}
 
 
-def _bitmap(look: Color | Array, repeat: tuple[float, float] = (1, 1)) -> dict[str, Any]:
+def bitmap(look: Color | Array, repeat: tuple[float, float] = (1, 1)) -> dict[str, Any]:
+    """A color, or an image, that is repeated so many times along u and v."""
     image = np.tile(np.array(look, dtype=np.float64), (2, 2, 1)) if isinstance(look, tuple) else look
     # raw: the values are reflectances, not sRGB values to be decoded.
     return {"type": "bitmap", "bitmap": image, "raw": True, "to_uv": np.diag((*repeat, 1.0, 1.0))}

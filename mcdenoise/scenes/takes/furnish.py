@@ -12,10 +12,10 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, Model, Surface, read_normal_map
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, place
+from mcdenoise.scenes.random.builder import Part, SceneBuilder, place
 from mcdenoise.scenes.random.furniture import ornament
-from mcdenoise.scenes.random.lights import light_color
-from mcdenoise.scenes.random.materials import Bsdf, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
+from mcdenoise.scenes.random.lights import bulb, light_color
+from mcdenoise.scenes.random.materials import Bsdf, bitmap, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
 from mcdenoise.scenes.random.rooms import furnish
 from mcdenoise.scenes.random.textures import Rng
 
@@ -106,10 +106,8 @@ def add_model(
     for lamp in model.lamps if brightness else ():
         radius = max(lamp.diameter / 2 * scale, 0.01)
         center = box[:3, :3] @ np.clip(lamp.center, -1, 1) + box[:3, 3]
-        power = brightness / len(model.lamps) / (4 * math.pi**2 * radius**2)
-        red, green, blue = light_color(rng)
-        black = builder.material(diffuse((0.02, 0.02, 0.02)))
-        parts.append(ball(center, radius, black, (red * power, green * power, blue * power)))
+        color, black = light_color(rng), builder.material(diffuse((0.02, 0.02, 0.02)))
+        parts.append(bulb(center, radius, black, brightness / len(model.lamps), color))
     builder.add(parts, frame, movable=movable)
     stock.credits.add(f"{model.name} ({model.credit})")
     stock.triangles += sum(len(mesh.faces) for mesh, _ in found)
@@ -122,7 +120,7 @@ def _bsdf(rng: Rng, surface: Surface) -> Bsdf:
     look = surface.color.astype(np.float64)
     image = np.clip(look if look.ndim == 3 else np.tile(look, (2, 2, 1)), 0, 0.95)
     if not isinstance(surface.opacity, float):
-        return {"type": "mask", "opacity": _raw(surface.opacity.astype(np.float64)), "bsdf": diffuse(image)}
+        return {"type": "mask", "opacity": bitmap(surface.opacity.astype(np.float64)), "bsdf": diffuse(image)}
     if surface.opacity < 0.7:
         return pane()
     change = rng.random()
@@ -143,12 +141,8 @@ def bumpy(rng: Rng, stock: Stock, bsdf: Bsdf, repeat: float) -> Bsdf:
     path = stock.image(rng, stock.assets.normals) if stock.assets.normals else None
     if path is None or bsdf["type"] != "twosided":
         return bsdf
-    normals = _raw(read_normal_map(path).astype(np.float64), repeat)
+    normals = bitmap(read_normal_map(path).astype(np.float64), (repeat, repeat))
     return {"type": "twosided", "bsdf": {"type": "normalmap", "normalmap": normals, "bsdf": bsdf["bsdf"]}}
-
-
-def _raw(image: Array, repeat: float = 1.0) -> Bsdf:
-    return {"type": "bitmap", "bitmap": image, "raw": True, "to_uv": np.diag((repeat, repeat, 1.0, 1.0))}
 
 
 class Floor:

@@ -10,7 +10,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh, read_sky
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, box, place, sheet
-from mcdenoise.scenes.random.lights import add_lamps, light_color, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.lights import add_lamps, light_color, scaled, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import diffuse, glass, random_opaque
 from mcdenoise.scenes.random.rooms import (
     closed_wall,
@@ -113,8 +113,8 @@ def _surface(builder: SceneBuilder) -> float:
 def _day(rng: Rng, stock: Stock) -> SceneBuilder:
     """A furnished room lit through its windows."""
     windows = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.4, 0.4, 0.2]))].tolist()
-    red, green, blue = (10 * channel for channel in light_color(rng))
-    glow = (red, green, blue) if rng.random() < _GLOWING else None
+    color = scaled(light_color(rng), 10)
+    glow = color if rng.random() < _GLOWING else None
     builder, opening = _room(rng, windows, glow)
     level = float(np.clip(0.25 * _surface(builder) / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
     sun = sun_direction(rng, outwards(windows[0])) if rng.random() < 0.65 else None
