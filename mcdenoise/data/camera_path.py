@@ -109,25 +109,15 @@ def load_camera_path(path: Path) -> CameraPath:
         content = {"frames": [content]}
     if not isinstance(content, dict) or not any(isinstance(content.get(key), list) for key in ("to_world", "frames")):
         raise InputError(f"{path}: expected a list 'to_world' (matrices) or 'frames' (look_at), found neither")
-    where = "'fov'"
-    try:
-        cameras = []
-        if isinstance(content.get("to_world"), list):
-            fov = _fov_x(content, content)
-            for number, matrix in enumerate(content["to_world"]):
-                where = f"'to_world' of frame {number}"
-                cameras.append(Camera(_check_pose(np.array(matrix, dtype=np.float64)), fov))
-        else:
-            for number, entry in enumerate(content["frames"]):
-                where = f"camera of frame {number}"
-                entry = entry.get("camera", entry)
-                pose = entry.get("transform", entry)
-                fov = _fov_x(entry if "fov" in entry else content, content)
-                camera = Camera.look_at(pose["position"], pose["look_at"], fov, pose.get("up", (0, 1, 0)))
-                cameras.append(Camera(_check_pose(camera.to_world), fov))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        missing = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{path}: {where} is unusable: {missing}") from error
+    if isinstance(content.get("to_world"), list):
+        content["frames"] = [{"to_world": matrix} for matrix in content["to_world"]]
+    cameras = []
+    for number, entry in enumerate(content["frames"]):
+        try:
+            cameras.append(_camera(entry.get("camera", entry), content))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            missing = f"nothing under {error}" if isinstance(error, KeyError) else str(error)
+            raise InputError(f"{path}: camera of frame {number} is unusable: {missing}") from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera, found none")
     try:
@@ -197,6 +187,15 @@ def view_projection(camera: Camera, width: int, height: int, near: float, far: f
     projection[2, 2:] = far / (far - near), -far * near / (far - near)
     projection[3, 2] = 1
     return np.asarray((projection @ np.linalg.inv(camera.to_world)).T)
+
+
+def _camera(entry: dict[str, Any], content: dict[str, Any]) -> Camera:
+    """The camera of a frame, by its matrix or by what it looks at."""
+    fov, pose = _fov_x(entry if "fov" in entry else content, content), entry.get("transform", entry)
+    if "to_world" in pose:
+        return Camera(_check_pose(np.array(pose["to_world"], dtype=np.float64)), fov)
+    camera = Camera.look_at(pose["position"], pose["look_at"], fov, pose.get("up", (0, 1, 0)))
+    return Camera(_check_pose(camera.to_world), fov)
 
 
 def _check_pose(matrix: Array) -> Array:

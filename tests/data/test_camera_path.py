@@ -29,7 +29,7 @@ def moving(objects: object) -> str:
         ("{", "expected JSON"),
         ("[]", "expected a list 'to_world'"),
         ('{"fov": 70, "to_world": []}', "at least one camera"),
-        ('{"to_world": [[]]}', "'fov' is unusable"),
+        ('{"to_world": [[]]}', "unusable: nothing under 'fov'"),
         ('{"fov": 270, "to_world": [[]]}', "between 0 and 180"),
         ('{"fov": 70, "to_world": [[[1, 0], [0, 1]]]}', "frame 0 is unusable: expected a finite 4x4"),
         (json.dumps({"fov": 70, "to_world": [SCALED]}), "without scaling"),
