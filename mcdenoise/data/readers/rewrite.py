@@ -11,7 +11,6 @@ import mmap
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,17 +69,20 @@ def write_like(
 def _write_exr(
     source: Path, target: Path, channels: Mapping[tuple[int, str], Image], like: str, full_float: bool
 ) -> str:
+    copy = target.with_suffix(".copy.exr")
     # Reading and writing may raise any exception of the underlying library.
     try:
         expected = read_image_header(source).parts
         # The library skips unreadable parts with a printed warning. Suppressing that would also suppress the output of
         # all other threads.
-        copy = target.with_suffix(".copy.exr")
-        with _readable(source, copy) as originals:
-            file = OpenEXR.File(str(copy), separate_channels=True)
+        shutil.copyfile(source, copy)
+        originals = _make_readable(copy)
+        file = OpenEXR.File(str(copy), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except Exception as error:
         return f"{source} cannot be read again: {first_line(error)}"
+    finally:
+        copy.unlink(missing_ok=True)
     if not whole:
         return f"{source} has changed meanwhile, or has parts that cannot be written again"
     for (index, name), image in channels.items():
@@ -189,28 +191,23 @@ def records(content: bytes | mmap.mmap) -> Iterator[Record]:
             return
 
 
-@contextmanager
-def _readable(source: Path, copy: Path) -> Iterator[dict[tuple[int, bytes], bytes]]:
-    """Write a copy that OpenEXR's Python module can read, for as long as the block lasts.
+def _make_readable(copy: Path) -> dict[tuple[int, bytes], bytes]:
+    """Change a copy so that OpenEXR's Python module can read it.
 
-    Yields:
+    Returns:
         The original records by part and name of the placeholder, for :func:`_put_back`.
     """
     originals: dict[tuple[int, bytes], bytes] = {}
-    try:
-        shutil.copyfile(source, copy)
-        with copy.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
-            for each in list(records(content)):
-                # As long as the name was: a file says that it has long ones.
-                name = (b"~%d" % len(originals)).ljust(len(each.name), b"~")
-                text = name + b"\0string\0"
-                rest = each.end - each.start - len(text) - 4
-                if rest >= 0 and not _is_needed(each, content):
-                    originals[each.part, name] = content[each.start : each.end]
-                    content[each.start : each.end] = text + rest.to_bytes(4, "little") + b"." * rest
-        yield originals
-    finally:
-        copy.unlink(missing_ok=True)
+    with copy.open("r+b") as file, mmap.mmap(file.fileno(), 0) as content:
+        for each in list(records(content)):
+            # As long as the name was: a file says that it has long ones.
+            name = (b"~%d" % len(originals)).ljust(len(each.name), b"~")
+            text = name + b"\0string\0"
+            rest = each.end - each.start - len(text) - 4
+            if rest >= 0 and not _is_needed(each, content):
+                originals[each.part, name] = content[each.start : each.end]
+                content[each.start : each.end] = text + rest.to_bytes(4, "little") + b"." * rest
+    return originals
 
 
 def _put_back(target: Path, originals: dict[tuple[int, bytes], bytes]) -> None:
