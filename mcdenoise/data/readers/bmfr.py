@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -290,16 +290,16 @@ def write_buffer(folder: Path, number: int, name: str, buffer: Tensor) -> None:
     write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float)
 
 
-def has_buffer(folder: Path, number: int, name: str, size: tuple[int, int]) -> bool:
-    """Whether a complete file of a buffer exists, see :func:`is_whole`.
+def has_buffers(folder: Path, number: int, names: Iterable[str], size: tuple[int, int]) -> bool:
+    """Whether the files of some buffers exist and are complete, see :func:`is_whole`.
 
     Args:
-        folder: folder of the file.
+        folder: folder of the files.
         number: frame number.
-        name: name of the buffer.
+        names: names of the buffers.
         size: expected width and height in pixels.
     """
-    return is_whole(folder / f"{_STEMS[name]}{number}.exr", size, BUFFERS[name].channels)
+    return all(is_whole(folder / f"{_STEMS[name]}{number}.exr", size, BUFFERS[name].channels) for name in names)
 
 
 def is_whole(path: Path, size: tuple[int, int], channels: int) -> bool:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_path import Array, Camera, check_moves, view_projection
 from mcdenoise.data.images import Image, read_channels, read_image_header
-from mcdenoise.data.readers.bmfr import CLEAN, has_buffer, noise_seed_folder, write_buffers
+from mcdenoise.data.readers.bmfr import CLEAN, has_buffers, noise_seed_folder, write_buffers
 from mcdenoise.data.readers.diffuse_specular import find_splits
 from mcdenoise.data.readers.files import SKY, as_tensor, far_points
 from mcdenoise.data.readers.layers import layers_of, read_files
@@ -132,13 +132,9 @@ def render_cycles(
         seed=seed,
         position_limit_squared=(0.005 * scale) ** 2,
     )
-    # The color is written last.
-    last = {*_FEATURES, "specular" if parts else "color", "color"}
-
-    def there(number: int, noise_seed: int) -> bool:
-        return all(has_buffer(noise_seed_folder(folder.path, noise_seed), number, name, size) for name in last)
-
-    noisy = [(n, k) for n in range(count) for k in reversed(range(noise_seeds)) if not there(n, k)]
+    names = (*_FEATURES, *(["specular"] if parts else []), "color")
+    seeds = {k: noise_seed_folder(folder.path, k) for k in reversed(range(noise_seeds))}
+    noisy = [(n, k) for n in range(count) for k, own in seeds.items() if not has_buffers(own, n, names, size)]
     clean = [n for n in range(count) if clean_samples and n not in folder.references]
     total = count * (noise_seeds * samples + clean_samples)
     done = total - len(noisy) * samples - len(clean) * clean_samples
@@ -174,7 +170,7 @@ def render_cycles(
         for number, noise_seed in noisy:
             back = {index + 1: to_previous(moves[name], number) for index, name in enumerate(movers)}
             found = shot(number, samples, 1 + noise_seed if noise_seed else 0, back)
-            write_buffers(noise_seed_folder(folder.path, noise_seed), number, found)
+            write_buffers(seeds[noise_seed], number, found)
         for number in clean:
             found = shot(number, clean_samples, _REFERENCE_STREAM, {})
             write_buffers(folder.path / CLEAN, number, {name: found[name] for name in ("albedo", "normal")})

@@ -13,7 +13,7 @@ import torch
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.data.exr import read_exr
-from mcdenoise.data.readers.bmfr import CLEAN, has_buffer, noise_seed_folder, write_buffers
+from mcdenoise.data.readers.bmfr import CLEAN, has_buffers, noise_seed_folder, write_buffers
 from mcdenoise.data.readers.files import as_tensor
 from mcdenoise.data.readers.samples import FEATURES
 from mcdenoise.scenes.render.features import STRATIFIED_PATHS, SequenceTracer
@@ -33,13 +33,12 @@ _loaded: dict[Path, SequenceTracer] = {}
 
 @dataclass(frozen=True, kw_only=True)
 class FrameJob:
-    """Settings common to all frames, those of :func:`mcdenoise.scenes.render.render_sequence`, and the state on disk.
+    """Settings common to all frames, those of :func:`mcdenoise.scenes.render.render_sequence`.
 
     Args:
         load: makes the tracer of the scene.
         folder: ``inputs`` of the sequence.
         references: frames that get a reference.
-        started: progress of the references on disk.
     """
 
     load: Callable[[], SequenceTracer]
@@ -54,7 +53,6 @@ class FrameJob:
     references: frozenset[int]
     seed: int
     keep_samples: bool
-    started: dict[int, ReferenceState]
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -68,21 +66,22 @@ class FrameJob:
 
     def has(self, number: int, noise_seed: int, names: tuple[str, ...]) -> bool:
         """Whether a frame has complete buffers of a noise seed."""
-        folder = noise_seed_folder(self.folder, noise_seed)
-        return all(has_buffer(folder, number, name, self.size) for name in names)
+        return has_buffers(noise_seed_folder(self.folder, noise_seed), number, names, self.size)
 
     def is_finished(self, number: int) -> bool:
         """Whether all files of a frame exist."""
         noisy = all(self.has(number, noise_seed, self.noisy) for noise_seed in range(self.noise_seeds))
         return noisy and self.has(number, 0, self.features) and not self.wants_reference(number)
 
+    def reference(self, number: int) -> ReferenceState:
+        """What there is of the reference of a frame."""
+        return reference_state(reference_file(self.folder, number), self.size) or ReferenceState(0, 0, None)
+
     def wants_reference(self, number: int) -> bool:
         """Whether the reference of a frame is missing or unfinished."""
-        state = self.started.get(number)
-        if number not in self.references or state is None:
-            return number in self.references
+        state = self.reference(number)
         reliable = state.spp >= 2 * _FEWEST_PATHS_IN_A_HALF
-        return not self.is_good(state.spp, state.noise if reliable else None)
+        return number in self.references and not self.is_good(state.spp, state.noise if reliable else None)
 
     def is_good(self, spp: int, noise: float | None) -> bool:
         """Whether this number of paths, or this noise, is sufficient for a reference."""
@@ -92,8 +91,8 @@ class FrameJob:
     def paths_left(self, number: int) -> int:
         """Number of paths per pixel that a frame lacks."""
         colors = sum(not self.has(number, noise_seed, self.noisy) for noise_seed in range(self.noise_seeds))
-        there = self.started[number].spp if number in self.started else 0
-        return colors * self.spp + (self.reference_spp - there if self.wants_reference(number) else 0)
+        reference = self.reference_spp - self.reference(number).spp if self.wants_reference(number) else 0
+        return colors * self.spp + reference
 
 
 def render_frame_task(job: FrameJob, number: int) -> ReferenceState | None:
@@ -118,7 +117,7 @@ def render_frame(
         advance: called with the number of paths per pixel after each pass.
 
     Returns:
-        Progress of its reference; ``None`` if nothing was done for it.
+        Progress of its reference; ``None`` without one.
 
     Raises:
         InputError: a file cannot be written.
@@ -127,9 +126,8 @@ def render_frame(
     if job.film is None and not job.has(number, 0, job.features):
         found = tracer.features(number)
         write_buffers(job.folder, number, {name: _image(found[name], job.size) for name in job.features})
-    state = None
     if job.wants_reference(number):
-        state = _refine_reference(job, tracer, number, advance)
+        _refine_reference(job, tracer, number, advance)
         if job.film is not None:
             clean = tracer.frame(number, _CLEAN_PATHS, (job.seed, number, 1, _CLEAN_STREAM))
             images = {name: _image(clean[name], job.size) for name in ("albedo", "normal")}
@@ -137,7 +135,7 @@ def render_frame(
     for noise_seed in reversed(range(job.noise_seeds)):
         if not job.has(number, noise_seed, job.noisy):
             _render_noisy(job, tracer, number, noise_seed, advance)
-    return state
+    return reference_state(reference_file(job.folder, number), job.size)
 
 
 def _render_noisy(
@@ -164,9 +162,7 @@ def _render_noisy(
     write_buffers(folder, number, ({"samples": torch.stack(kept, 1)} if kept else {}) | images)
 
 
-def _refine_reference(
-    job: FrameJob, tracer: SequenceTracer, number: int, advance: Callable[[int], None]
-) -> ReferenceState:
+def _refine_reference(job: FrameJob, tracer: SequenceTracer, number: int, advance: Callable[[int], None]) -> None:
     """Add passes to a reference until it is finished, and write it."""
     halves = ReferenceHalves(np.zeros((job.size[0] * job.size[1], 3)))
     for unfinished in (True, False):
@@ -174,7 +170,7 @@ def _refine_reference(
         if (before := reference_state(path, job.size)) is not None:
             halves = ReferenceHalves(read_exr(path)[0].reshape(-1, 3).astype(np.float64), before.spp, before.passes)
             break
-    advance(halves.spp - (job.started[number].spp if number in job.started else 0))
+    advance(halves.spp - job.reference(number).spp)
     saved = time.monotonic()
     while not job.is_good(halves.spp, _reliable_noise(halves)):
         missing = job.reference_spp - halves.spp
@@ -191,7 +187,6 @@ def _refine_reference(
     advance(max(0, job.reference_spp - halves.spp))
     write_reference(job.folder, number, _image(halves.mean(), job.size), halves.state)
     reference_file(job.folder, number, unfinished=True).unlink(missing_ok=True)
-    return halves.state
 
 
 def _reliable_noise(halves: ReferenceHalves) -> float | None:

@@ -154,7 +154,6 @@ def render_sequence(
         references=references,
         seed=seed,
         keep_samples=keep_samples,
-        started=dict(folder.references),
     )
 
     total = count * noise_seeds * spp + len(references) * reference_spp
