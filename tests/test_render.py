@@ -170,11 +170,12 @@ def test_another_scene_of_the_same_name_is_refused(tmp_path: Path) -> None:
     assert "scene_sha256" in refused(render_sequence, scene, demo_cameras(1), tmp_path, **settings)
 
 
-@pytest.mark.parametrize("missing", [None, "frames", "camera_matrices"])
+@pytest.mark.parametrize("missing", [None, "frames", "camera_matrices", "end"])
 def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missing: str | None) -> None:
     folder = tmp_path / "inputs"
     shutil.copytree(sequence, folder)
     about = {key: value for key, value in describe(folder).items() if key != missing}
+    about |= {"frames": float("inf")} if missing == "end" else {}
     (folder / "camera.json").write_text(json.dumps(about) if missing else "{")
     settings = {**SCALAR, "reference_frames": []}
     assert "camera.json:" in refused(render_sequence, demo_scene(), demo_cameras(9)[:1], tmp_path, **settings)

@@ -155,7 +155,7 @@ class SequenceFolder:
             found, wanted = ({"": each["camera_matrices"], **each.get("moves", {})} for each in (before, settings))
             common, both = range(min(int(before["frames"]), settings["frames"])), found.keys() & wanted.keys()
             moved = [(each, name) for each in common for name in both if found[name][each] != wanted[name][each]]
-        except (OSError, ValueError, KeyError, IndexError, TypeError, RecursionError) as error:
+        except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
             raise InputError(f"{described}: cannot be read, so the run cannot be resumed; {_ADVICE}") from error
         for key in _IDENTITY:
             if before.get(key) != settings.get(key):
