@@ -155,11 +155,10 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     color, size = light_color(rng), float(np.exp(rng.uniform(math.log(0.03), math.log(0.6))))
     black = builder.material(diffuse((0.02, 0.02, 0.02)))
     if rng.random() < 0.4:
-        builder.add([ball(origin, size / 2, black, scaled(color, power / (math.pi**2 * size**2)))])
+        builder.add([bulb(origin, size / 2, black, power, color)])
         return
     half_size = (size, size * float(rng.uniform(0.3, 1)))
-    radiance = scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
-    builder.add([sheet(origin, half_size, black, _facing(origin, target, (0.0, 1.0, 0.0)), radiance)])
+    builder.add([_glowing(origin, half_size, black, power, color, _facing(origin, target, (0.0, 1.0, 0.0)))])
 
 
 def _facing(origin: Array, target: Array, up: Point) -> Array:
@@ -173,18 +172,16 @@ def _facing(origin: Array, target: Array, up: Point) -> Array:
 
 
 def _glowing(
-    builder: SceneBuilder, center: Point, half_size: tuple[float, float], power: float, color: Color, degrees: float
-) -> dict[str, str]:
-    """Add a white sheet that sends out a power, and return its material."""
-    white = builder.material(diffuse((0.8, 0.8, 0.8)))
-    radiance = scaled(color, power / (math.pi * 4 * half_size[0] * half_size[1]))
-    builder.add([sheet(center, half_size, white, rotate("x", degrees), radiance)])
-    return white
+    center: Vector, half: tuple[float, float], material: dict[str, str], power: float, color: Color, rotation: Array
+) -> Part:
+    """A sheet that sends out a power."""
+    return sheet(center, half, material, rotation, scaled(color, power / (math.pi * 4 * half[0] * half[1])))
 
 
 def _panel(builder: SceneBuilder, center: Point, half_size: tuple[float, float], power: float, color: Color) -> None:
-    white = _glowing(builder, center, half_size, power, color, 90)
+    white = builder.material(diffuse((0.8, 0.8, 0.8)))
     frame = (center[0], center[1] + 0.012, center[2])
+    builder.add([_glowing(center, half_size, white, power, color, rotate("x", 90))])
     builder.add([box(frame, (2 * half_size[0] + 0.06, 0.02, 2 * half_size[1] + 0.06), white)])
 
 
@@ -224,10 +221,10 @@ def _cove(builder: SceneBuilder, rng: Rng, power: float, color: Color) -> None:
     x = float(low[0] if side < 0 else high[0]) - side * 0.12
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
     length = 0.85 * float(high[2] - low[2])
-    white = _glowing(builder, (x, y + 0.03, z), (0.04, length / 2), 1.5 * power, color, -90)
-    builder.add(
-        [box((x, y, z), (0.2, 0.03, length), white), box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)]
-    )
+    white = builder.material(diffuse((0.8, 0.8, 0.8)))
+    builder.add([_glowing((x, y + 0.03, z), (0.04, length / 2), white, 1.5 * power, color, rotate("x", -90))])
+    builder.add([box((x, y, z), (0.2, 0.03, length), white)])
+    builder.add([box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)])
 
 
 def _chandelier(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color) -> None:
