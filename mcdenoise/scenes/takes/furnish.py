@@ -152,8 +152,8 @@ class Floor:
         self.low, self.high = low, high
         self._taken: list[tuple[float, float, float, float]] = []
 
-    def find(self, rng: Rng, width: float, depth: float, *, walls: float = 0.7) -> tuple[float, float, float] | None:
-        """x, z and turn in degrees of a free place: along a wall, facing inwards, or anywhere."""
+    def find(self, rng: Rng, width: float, depth: float, top: float = 0.0, *, walls: float = 0.7) -> Array | None:
+        """A free place at a height: along a wall, facing inwards, or anywhere."""
         for _ in range(14):
             wall = int(rng.integers(4))
             turn = (0.0, 90.0, 180.0, -90.0)[wall]
@@ -171,7 +171,7 @@ class Floor:
             box = (x - half[0], x + half[0], z - half[1], z + half[1])
             if all(box[1] < a or box[0] > b or box[3] < c_ or box[2] > d for a, b, c_, d in self._taken):
                 self._taken.append(box)
-                return float(x), float(z), turn
+                return place((x, top, z), turn)
         return None
 
 
@@ -188,10 +188,9 @@ def fill_room(builder: SceneBuilder, rng: Rng, stock: Stock, brightness: float) 
         model = stock.model(rng, pieces)
         if model is None:
             break
-        spot = floor.find(rng, model.size[0], model.size[2])
-        if spot is None:
+        frame = floor.find(rng, model.size[0], model.size[2])
+        if frame is None:
             continue
-        frame = place((spot[0], 0, spot[1]), spot[2])
         lit = brightness * rng.uniform(0.05, 0.4) if model.lamps else 0.0
         small = max(model.size) < 1.2
         if add_model(builder, rng, stock, model, frame, movable=small, brightness=lit) and model.top > 0.1:
@@ -220,10 +219,10 @@ def fill_top(
         size = float(rng.uniform(0.06, 0.3)) * min(1.0, max(width, depth))
         if model is not None and rng.random() < 0.2:
             model = None
-        spot = surface.find(rng, *((size, size) if model is None else (model.size[0], model.size[2])), walls=0)
+        spot = surface.find(rng, *((size, size) if model is None else (model.size[0], model.size[2])), top, walls=0)
         if spot is None:
             continue
-        where = frame @ place((spot[0], top, spot[1]), spot[2])
+        where = frame @ spot
         if model is None:
             builder.add(ornament(builder, rng, size), where, movable=True)
             builder.points.append(where[:3, 3])

@@ -181,9 +181,8 @@ def _street(rng: Rng, stock: Stock) -> SceneBuilder:
     floor, choices = Floor(builder.low, builder.high), stock.outside()
     for _ in range(int(rng.integers(4, 15))):
         model = stock.model(rng, choices)
-        spot = floor.find(rng, model.size[0], model.size[2], walls=0) if model else None
-        if model and spot:
-            frame = place((spot[0], 0, spot[1]), spot[2])
+        frame = floor.find(rng, model.size[0], model.size[2], walls=0) if model else None
+        if model and frame is not None:
             add_model(builder, rng, stock, model, frame, movable=max(model.size) < 3)
     sun = sun_direction(rng) if rng.random() < 0.75 else None
     builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
