@@ -250,8 +250,7 @@ def _read(path: Path, with_parts: bool) -> dict[str, Image]:
             raise InputError(
                 f"Blender's pass '{name}': expected it in the frame just rendered, found {', '.join(layers)}"
             )
-        pixels = read_channels(path, {layer.part: layer.channels})[layer.part]
-        found[name] = pixels if pixels.shape[-1] < 3 else pixels[..., :3]
+        found[name] = read_channels(path, {layer.part: layer.channels[:3]})[layer.part]
     return found
 
 
