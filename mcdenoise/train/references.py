@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from mcdenoise.reading import read_text
 # Side of the window in which errors are averaged; part of a middle gray that darker surroundings count as; the largest
 # squared relative difference, since a firefly in a half is no error of the other one's denoised image.
 _WINDOW, _DARK, _LARGEST = 7, 0.02, 25.0
+# What the description of a copy says: how it was made, and from which content.
+_FILTER, _SOURCE = "reference_filter", "source"
 
 
 def cleaned(first: Tensor, second: Tensor, denoise: Callable[[Tensor], Tensor]) -> Tensor:
@@ -85,14 +88,14 @@ def clean_references(source: Path, out: Path) -> Path:
     Args:
         source: file of the take, or folder of the sequence. If features of a sequence have noise, this noise will be in
             the references.
-        out: folder for the copy. A finished copy is kept.
+        out: folder for the copy. A finished copy of what the source holds now is kept; an older one is made anew.
 
     Returns:
         The copy, ``out/NAME``.
 
     Raises:
-        InputError: the optional package pyoidn is missing, a file is damaged, a take has no error of its references, or
-            the copy cannot be written.
+        InputError: the optional package pyoidn is missing, a file is damaged, a take has no error of its references,
+            the copy cannot be written, or something else is in its place.
     """
     if find_shards(source) == [source]:
         return _clean_take(source, out / source.name)
@@ -101,9 +104,15 @@ def clean_references(source: Path, out: Path) -> Path:
     inputs = source / "inputs" if (source / "inputs").is_dir() else source
     copied = out / sequence.name / "inputs"
     # Written last, as a sign that the copy is complete.
-    description = copied / "camera.json"
-    if description.exists():
+    description, checksum = copied / "camera.json", _checksum(inputs)
+    found = json.loads(read_text(description)) if description.exists() else {}
+    if _is_copy(found, checksum, copied):
         return copied.parent
+    if copied.exists() and copied.samefile(inputs):
+        raise InputError(f"{out}: expected another folder than that of the sequence, found the same")
+    if found:
+        # Also frames that the sequence no longer has.
+        shutil.rmtree(copied)
     ignored = shutil.ignore_patterns("reference*.exr", description.name, ".*")
     shutil.copytree(inputs, copied, ignore=ignored, dirs_exist_ok=True)
     for number in sequence.reference_numbers:
@@ -119,15 +128,31 @@ def clean_references(source: Path, out: Path) -> Path:
     about = json.loads(read_text(rendered)) if rendered.exists() else {}
     # Remove statements about the references that no longer hold, so that no renderer refines them as means of paths.
     about = {key: value for key, value in about.items() if key not in ("reference_spp", "reference_noise")}
-    write_text(description, json.dumps({**about, "reference_filter": "Open Image Denoise, high, clean aux"}) + "\n")
+    about |= {_FILTER: "Open Image Denoise, high, clean aux", _SOURCE: checksum}
+    write_text(description, json.dumps(about) + "\n")
     return copied.parent
+
+
+def _is_copy(found: Mapping[str, Any], checksum: str, place: Path) -> bool:
+    """Whether a finished copy, by its description, is one of this content; one of other content may be replaced."""
+    if found and _FILTER not in found:
+        raise InputError(f"{place}: expected a copy with clean references, found something else; choose another folder")
+    return found.get(_SOURCE) == checksum
+
+
+def _checksum(folder: Path) -> str:
+    """That of all files of a sequence but hidden ones, which are temporary files of a renderer."""
+    whole = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("[!.]*") if path.is_file()):
+        whole.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return whole.hexdigest()
 
 
 def _clean_take(source: Path, out: Path) -> Path:
     """Copy a packed take with clean references, and without their error."""
-    if out.exists():
-        return out
     shard = open_shard(source)
+    if out.exists() and _is_copy(open_shard(out).header, shard.digest, out):
+        return out
     if ERROR not in shard.shapes:
         raise InputError(f"{source}: expected a take with {ERROR}, which tells its halves, found none; render it anew")
     arrays: dict[str, Any] = shard.read()
@@ -146,5 +171,6 @@ def _clean_take(source: Path, out: Path) -> Path:
     arrays["reference"] = cleaned((mean + error).clamp_min(0), (mean - error).clamp_min(0), denoise).numpy()
     del arrays[ERROR]
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_shard(out, {**shard.header, "reference_filter": "Open Image Denoise, as far as two halves agree"}, arrays)
+    own = {_FILTER: "Open Image Denoise, as far as two halves agree", _SOURCE: shard.digest}
+    write_shard(out, {**shard.header, **own}, arrays)
     return out

@@ -13,6 +13,7 @@ from refusals import refused
 
 from mcdenoise.cli.train import options_of
 from mcdenoise.data import open_sequence
+from mcdenoise.errors import InputError
 from mcdenoise.models import describe_weights
 from mcdenoise.train import Recipe, Rendering, clean_references
 
@@ -229,4 +230,22 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
     assert {name for name in before if not torch.equal(before[name], after[name])} == {"reference"}
     # Facts about the references as rendered are not stated of the filtered ones.
     said = json.loads((copied / "inputs" / "camera.json").read_text())
-    assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux"}
+    assert said == {**about, "reference_filter": "Open Image Denoise, high, clean aux", "source": said["source"]}
+
+
+def test_references_are_cleaned_anew_if_the_sequence_has_changed(small_sequence: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    copied = clean_references(small_sequence, tmp_path / "out")
+    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*")}
+    assert clean_references(small_sequence, tmp_path / "out") == copied
+    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*")} == before
+    inputs = small_sequence / "inputs"
+    shutil.copyfile(inputs / "reference0.exr", inputs / "reference1.exr")
+    for path in inputs.glob("*3.exr"):
+        path.unlink()
+    again = open_sequence(clean_references(small_sequence, tmp_path / "out"))
+    assert again.numbers == [0, 1, 2]
+    assert (copied / "inputs" / "reference1.exr").stat().st_mtime_ns > max(before.values())
+    # The sequence itself is no copy, and stays.
+    with pytest.raises(InputError, match="expected a copy with clean references"):
+        clean_references(small_sequence, small_sequence.parent)

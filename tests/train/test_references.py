@@ -69,5 +69,11 @@ def test_a_take_is_copied_with_clean_references(tmp_path: Path) -> None:
     assert error(reference, PLAIN) < 0.2 * error((halves(PLAIN, 0.3)[0] + halves(PLAIN, 0.3)[1]) / 2, PLAIN)
     written = copy.path.stat().st_mtime_ns
     assert clean_references(source, out).stat().st_mtime_ns == written
+    # Rendered anew, with another reference alone.
+    write_shard(source, {"number": 7, "credits": []}, arrays | {"reference": 2 * arrays["reference"]})
+    again = open_shard(clean_references(source, out)).read()["reference"]
+    assert again.mean() == pytest.approx(2 * found["reference"].mean(), rel=0.05)
+    with pytest.raises(InputError, match=r"7\.take\.npz: expected a copy with clean references"):
+        clean_references(source, tmp_path)
     with pytest.raises(InputError, match=r"7\.take\.npz: expected a take with reference_error"):
         clean_references(copy.path, tmp_path / "again")
