@@ -1,5 +1,6 @@
 """Takes: what a number draws, where samples lie, what frames of a known scene hold, and training on the files."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,12 @@ import pytest
 
 from mcdenoise.cli import main
 from mcdenoise.data.camera_path import Camera
-from mcdenoise.data.shards import find_shards, open_shard
+from mcdenoise.data.shards import find_shards, open_shard, write_shard
+from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.random.materials import diffuse, glass
 from mcdenoise.scenes.render.film import Film, curve, offsets, splat
+from mcdenoise.scenes.takes import TakePlan
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 NOTHING = Assets()
@@ -174,6 +177,23 @@ def test_exact_features_behind_a_lens_are_those_of_a_pinhole() -> None:
     sharp, _ = traced(known(film=Film("box", aperture=0.3, splat=False), features="exact"))
     assert np.allclose(sharp["motion"][0], SHIFT, atol=1e-4)
     assert np.allclose(sharp["depth"], 2, atol=1e-5)
+
+
+def test_a_folder_of_takes_is_of_one_variant(tmp_path: Path) -> None:
+    image = np.zeros((1, 3, 4, 4), np.float32)
+    header = {"renderer": "mitsuba 3.9.1 (llvm_ad_rgb, drjit 1.5.0), path integrator"}
+    write_shard(tmp_path / "000007.take.npz", header, {"color": image, "reference": image})
+    same, other = (
+        TakePlan(out=tmp_path, assets=NOTHING, unseen=False, variant=variant)
+        for variant in ("llvm_ad_rgb", "scalar_rgb")
+    )
+    # Folders did not say it before.
+    older = {name: value for name, value in same.identity.items() if name != "variant"}
+    (tmp_path / "takes.json").write_text(json.dumps(older))
+    for found in ("mitsuba .*llvm_ad_rgb", "llvm_ad_rgb;"):
+        with pytest.raises(InputError, match=f"expected takes with variant scalar_rgb, found {found}"):
+            other.render(7)
+        assert same.render(7).name == "000007.take.npz"
 
 
 def test_takes_are_generated_resumed_and_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

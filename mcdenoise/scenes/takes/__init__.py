@@ -12,7 +12,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.data.files import write_json
-from mcdenoise.data.shards import ERROR, SUFFIX, write_shard
+from mcdenoise.data.shards import ERROR, SUFFIX, find_shards, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.reading import read_text
 from mcdenoise.scenes.assets import Assets
@@ -100,6 +100,7 @@ class TakePlan(Plan):
         """What all takes of a folder have in common."""
         size = list(self.size) if self.size else None
         own = {"unseen": self.unseen, "assets": self.assets.digest, "frames": self.frames, "size": size}
+        own["variant"] = self.variant
         return {"takes": 1, **own, **({"plain": True} if self.plain else {}), "reference_spp": 2 * self.half}
 
     def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
@@ -120,6 +121,11 @@ def _claim(plan: TakePlan) -> None:
     except (OSError, ValueError) as error:
         raise InputError(f"{plan.out}: expected a folder to write takes to, found {error}") from error
     own = plan.identity
+    if "variant" not in found:
+        # Only the takes themselves tell it in an older folder.
+        names = {str(open_shard(path).header.get("renderer")) for path in find_shards(plan.out)}
+        others = sorted(name for name in names if f"({plan.variant}, " not in name)
+        found["variant"] = ", ".join(others) or plan.variant
     for key in sorted(found.keys() | own):
         if found.get(key) != own.get(key):
             raise InputError(
