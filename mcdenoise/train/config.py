@@ -56,7 +56,7 @@ class TrainConfig:
             average is validated, and is the result of the run. 0 uses the weights themselves.
         start_every: a shot of a model that accumulates also begins at every n-th frame, to train on short histories.
         validation_frames: number of frames at the end of each sequence that are kept for validation (the paper's 4); 0
-            for a sequence with less than one clip left.
+            for takes, and for a sequence with less than one clip left.
         lamps: probability that a clip gets lamps: rectangles of constant radiance, without noise, brighter than the
             rest.
         exposure: the light of a clip is scaled by up to this many stops.

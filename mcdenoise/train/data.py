@@ -76,7 +76,7 @@ class TrainingData:
         used = (needs.buffers | needs.uses) - front.parts.keys() - {"samples"}
         for source in sources:
             check_trainable(source, needs.buffers - front.parts.keys() | (used & set(FEATURES)))
-        for doubt in _doubts(sources, used, accumulates=front.accumulates):
+        for doubt in _doubts(sources, used, config.validation_frames * (not validation), accumulates=front.accumulates):
             warnings.warn(doubt, stacklevel=level_of_caller())
         # The last frames of a sequence are kept for validation, unless too few would remain.
         least, held = config.frames + config.validation_frames, [0] * len(takes)
@@ -112,8 +112,10 @@ class TrainingData:
         return TrainingData(sampler, watched, description)
 
 
-def _doubts(sources: list[Source], used: frozenset[str], *, accumulates: bool) -> Iterator[str]:
-    """What a model is trained without although it would use it, in words."""
+def _doubts(sources: list[Source], used: frozenset[str], kept: int, *, accumulates: bool) -> Iterator[str]:
+    """What a model is trained without although it would use it, and what it is not validated on, in words."""
+    if kept and any(isinstance(source, Shard) for source in sources):
+        yield f"validation_frames: expected 0 for takes, found {kept}; name other takes to validate on"
     found = [features_of(source) for source in sources]
     still = [source for source, own in zip(sources, found, strict=True) if len(source) > 1 and not tells_motion(own)]
     if still and (accumulates or used & MOTION):

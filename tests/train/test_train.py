@@ -177,16 +177,18 @@ def test_weights_name_the_authors_of_packed_takes(tmp_path: Path) -> None:
 )
 def test_clips_of_unequally_many_references_leave_no_run(tmp_path: Path, other: tuple[int, int], expected: str) -> None:
     takes = [take(tmp_path / "0.take.npz", 4, 2), take(tmp_path / "1.take.npz", *other)]
-    config = TrainConfig(**{**SMALL, "frames": 3})
+    config = TrainConfig(**{**SMALL, "frames": 3, "validation_frames": 0})
     assert expected in refused(lambda: train(config, takes, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
 def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
     takes = [take(tmp_path / "0.take.npz", 3, 1)]
-    message = refused(lambda: train(TrainConfig(**SMALL), takes, tmp_path / "run"))
+    message = refused(lambda: train(TrainConfig(**SMALL), takes, tmp_path / "run", validation=takes))
     assert message.startswith("temporal_weight: ")
-    train(TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0}), takes, tmp_path / "run")
+    config = TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0})
+    with pytest.warns(UserWarning, match="validation_frames: expected 0 for takes, found 1; name other takes"):
+        train(config, takes, tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -199,14 +201,15 @@ def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
 )
 def test_what_a_model_is_trained_without_is_said(tmp_path: Path, model: str, missing: str, expected: str) -> None:
     takes = [take(tmp_path / "0.take.npz", 3, 2), take(tmp_path / "1.take.npz", 3, 2, missing)]
-    config = TrainConfig(**{**SMALL, "model": model, "steps": 1})
+    config = TrainConfig(**{**SMALL, "model": model, "steps": 1, "validation_frames": 0})
     with pytest.warns(UserWarning, match=expected):
         train(config, takes, tmp_path / "run")
 
 
 def test_frames_that_repeat_the_noise_are_told(tmp_path: Path) -> None:
+    config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 0})
     with pytest.warns(UserWarning, match="0.take.npz: 2 of 3 frames have the noise of the frame before"):
-        train(TrainConfig(**{**SMALL, "steps": 1}), [take(tmp_path / "0.take.npz", 3, 2, "", True)], tmp_path / "run")
+        train(config, [take(tmp_path / "0.take.npz", 3, 2, "", True)], tmp_path / "run")
 
 
 def test_averaged_weights_are_what_is_validated_and_kept(shared_sequence: Path, tmp_path: Path) -> None:
