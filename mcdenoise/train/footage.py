@@ -19,6 +19,7 @@ from mcdenoise.errors import InputError, level_of_caller
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models._history import motion_to_previous
+from mcdenoise.models._void import without_void
 from mcdenoise.train.cache import Keep, open_cache
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Array, Shot
@@ -27,6 +28,8 @@ Source: TypeAlias = Sequence | Shard
 
 # Networks that use these buffers would learn to work without them if they were missing, which is rarely intended.
 FEATURES = ("albedo", "normal", "depth")
+# Name of the reference while void pixels are filled: one of this name would be left as it is.
+_TRUTH = "(reference)"
 # Radiance without its albedo may exceed half floats.
 _LARGEST = 65504.0
 
@@ -94,8 +97,8 @@ def shots_of(
     kept, and there is one other shot.
 
     A sequence is decoded and processed at once if it is not in the cache. A take is read and processed when the first
-    clip is drawn from it, and is then kept in memory as half floats. A warning tells of frames that repeat the noise of
-    the frame before, which a history would count again.
+    clip is drawn from it, and is then kept in memory as half floats. Void pixels (of alpha 0) are filled, in references
+    too. A warning tells of frames that repeat the noise of the frame before, which a history would count again.
 
     Args:
         source: a sequence or a packed take, see :func:`check_trainable`.
@@ -124,7 +127,7 @@ def shots_of(
         if front.accumulates and references < length:
             first = max(length - frames, 0)
             later = later and [later[int(digest, 16) % len(later)]]
-        read = functools.partial(_packed, source, None if front.wrappers else wanted)
+        read = functools.partial(_packed, source)
     else:
         seeds = min(noise_seeds or source.noise_seeds, source.noise_seeds)
         keep = open_cache(source, [front.settings, sorted(wanted), noise_seeds], cache)
@@ -132,7 +135,7 @@ def shots_of(
         read, digest = functools.partial(_of_seed, arrays), arrays["sha256"].tobytes().hex()
 
     def handed(start: int, noise_seed: int) -> dict[str, Array]:
-        buffers = read(noise_seed)
+        buffers = _filled(read(noise_seed))
         if repeated := 0 if start else _repeated(buffers["color"]):
             warnings.warn(
                 f"{place_of(source)}: {repeated} of {length} frames have the noise of the frame before, pixel by "
@@ -160,11 +163,13 @@ def shots_of(
 def frame_of(arrays: Mapping[str, Array], t: int) -> Frame:
     """Frame ``t`` of the arrays of a take, without its reference."""
     images: dict[str, Any] = {
-        name: torch.from_numpy(array[t : t + 1].astype(np.float32))
-        for name, array in arrays.items()
-        if name not in ("reference", ERROR)
+        name: _image(array, t) for name, array in arrays.items() if name not in ("reference", ERROR)
     }
     return Frame(**images).validate()[0]
+
+
+def _image(array: Array, t: int) -> torch.Tensor:
+    return torch.from_numpy(array[t : t + 1].astype(np.float32))
 
 
 def _processed(arrays: Mapping[str, Array], front: Front, start: int, first: int) -> dict[str, Array]:
@@ -184,8 +189,26 @@ def _repeated(color: Array) -> int:
     return sum(bool(now.any() and np.array_equal(now, before)) for before, now in pairwise(color[:, :, ::8]))
 
 
-def _packed(shard: Shard, names: frozenset[str] | None, noise_seed: int) -> dict[str, Array]:
-    return shard.read(names)
+def _packed(shard: Shard, noise_seed: int) -> dict[str, Array]:
+    return shard.read()
+
+
+def _filled(buffers: Mapping[str, Array]) -> dict[str, Array]:
+    """The buffers with void pixels filled, as a denoiser fills them, the references alike.
+
+    So a network learns from the mirror images, too, and not that black ends at a rim.
+    """
+    arrays, lacking = dict(buffers), len(buffers["color"]) - len(buffers["reference"])
+    for t in range(len(buffers["color"])) if buffers.keys() & {"alpha", "mask"} else ():
+        images = {} if t < lacking else {_TRUTH: _image(buffers["reference"], t - lacking)}
+        frame, void = without_void(frame_of(buffers, t).replace(extra=images))
+        for name, image in frame.items() if void.mask is not None else ():
+            own, place = ("reference", t - lacking) if name == _TRUTH else (name, t)
+            if own in buffers:
+                # Those of a cache are only to be read.
+                arrays[own] = arrays[own] if arrays[own] is not buffers[own] else np.array(buffers[own])
+                arrays[own][place] = image[0]
+    return arrays
 
 
 def _as_halves(name: str, make: Callable[[], Mapping[str, Array]]) -> dict[str, Array]:

@@ -270,12 +270,16 @@ ALBEDO = frozenset({"albedo"})
 HISTORY = Front(((Demodulated, {}), (Accumulated, {"alpha_min": 0.03})))
 
 
-def take(folder: Path, frames: int = 8, references: int = 3) -> Shard:
+def take(folder: Path, frames: int = 8, references: int = 3, void: int = 0) -> Shard:
     draws = np.random.default_rng(frames)
     arrays = {name: draws.random((frames, 3, *SIZE)) for name in ("color", "albedo", "normal")}
     arrays |= {"motion": np.zeros((frames, 2, *SIZE)), "depth": np.ones((frames, 1, *SIZE))}
     arrays["reference"] = draws.random((references, 3, *SIZE))
     arrays["reference_error"] = draws.random((references, 3, *SIZE))
+    if void:
+        arrays["alpha"] = np.ones((frames, 1, *SIZE))
+        for name in ("color", "albedo", "normal", "alpha", "reference"):
+            arrays[name][..., :void] = 0
     path = folder / f"{frames}.take.npz"
     write_shard(path, {}, arrays)
     return open_shard(path)
@@ -321,3 +325,12 @@ def test_a_clip_of_a_still_has_as_many_parts_of_it(front: Front, tmp_path: Path)
     assert clip["color"].shape == clip["reference"].shape == (2, 3, 3, 8, 8)
     assert not torch.equal(clip["color"][:, 0], clip["color"][:, 1])
     assert ClipSampler(shots, 3, 8).draw(range(6))["color"].shape == (6, 3, 3, 8, 8)
+
+
+@pytest.mark.parametrize("front", [Front(), HISTORY], ids=["alone", "accumulated"])
+def test_void_pixels_show_what_is_beside_them_also_in_references(front: Front, tmp_path: Path) -> None:
+    """As in a denoiser, which fills them before a method sees a frame."""
+    read = shots_of(take(tmp_path, void=6), front, ALBEDO, 3, tmp_path / "cache")[0][0].read()
+    for images in (read.get("current", read["color"]), read["albedo"], read["reference"]):
+        assert images[..., :6].any()
+        assert torch.equal(images[..., :6].flip(-1), images[..., 6:12])
