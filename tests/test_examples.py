@@ -355,6 +355,8 @@ def packed(tmp_path: Path) -> Path:
     for number, (frames, references, *size) in enumerate([(13, 2, 128, 192), (1, 1, 128, 400)]):
         wall = {"albedo": np.full((frames, 3, *size), 0.5), "normal": np.ones((frames, 3, *size))}
         wall |= {"depth": np.ones((frames, 1, *size)), "motion": np.zeros((frames, 2, *size))}
+        # A background.
+        wall["depth"][..., :8, :], wall["albedo"][..., :8, :] = np.inf, 0
         light = {"color": image(frames, 3, *size), "reference": np.full((references, 3, *size), 0.5)}
         header = {"credits": ["sky (Ann, CC0)"], "spp": 1 + 3 * number}
         write_shard(tmp_path / "takes" / f"{number}.take.npz", header, wall | light)
@@ -372,6 +374,10 @@ def test_packed_takes_are_tiles_with_two_histories(packed: Path) -> None:
     assert short[:, -1].max() < 13
     assert long[:, :3].std() < short[:, :3].std() <= tiles.fixed[:2, :3].std()
     assert torch.equal(tiles.fixed[:, -3:], torch.full_like(tiles.fixed[:, -3:], 0.5))
+    # Nothing is accumulated where nothing is seen.
+    background = tiles.fixed[:2, :3, :8]
+    assert all(torch.equal(image, background) for image in long[:, :6, :8].split(3, 1))
+    assert torch.equal(long[:, -1:, :8], torch.ones_like(background[:, :1]))
 
 
 def test_a_part_that_lacks_new_takes_is_packed_again(packed: Path, tmp_path: Path) -> None:

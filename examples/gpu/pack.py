@@ -13,18 +13,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mcdenoise.data.files import atomic_path
 from mcdenoise.data.shards import Shard
 from mcdenoise.errors import run_script
+from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
+from mcdenoise.models.wild import _background
 from mcdenoise.train.data import describe_takes, open_takes
 from mcdenoise.train.footage import shots_of
 from mcdenoise.train.front import Front, split
 
-FEATURES = frozenset({"albedo", "normal"})
+FEATURES = frozenset({"albedo", "normal", "depth"})
 FIXED = ("current", "albedo", "normal", "reference")
 HISTORY = ("color", "recent", "length")
 # The last bits of a half float that are dropped.
@@ -53,6 +56,15 @@ def tiles(size: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
             yield slice(top, top + TILE[0]), slice(left, left + TILE[1])
 
 
+def seen(shot: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The frames as `wild` sees them where nothing is: without a history. The depth, which tells it, is not packed."""
+    behind = _background(Frame(shot["color"], albedo=shot["albedo"], depth=shot.get("depth")))
+    if behind is None:
+        return shot
+    alone = {"color": shot["current"], "recent": shot["current"], "length": torch.ones(())}
+    return shot | {name: torch.where(behind, image, shot[name]) for name, image in alone.items()}
+
+
 def part_of(shot: dict[str, Tensor], names: tuple[str, ...], place: tuple[slice, slice]) -> NDArray[np.float16]:
     """A tile of these buffers, together ``(T, C, H, W)``."""
     return np.concatenate([shot[name][:, :, *place].numpy() for name in names], 1, dtype=np.float16)
@@ -63,7 +75,7 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
     fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
     for shard in shards:
         handed = front.of(shard.shapes), FEATURES, shard.references, path.parent
-        shots = [shot.read() for shot in shots_of(shard, *handed, start_every=1)[0]]
+        shots = [seen(shot.read()) for shot in shots_of(shard, *handed, start_every=1)[0]]
         name, spp = shard.path.name.partition(".")[0], shard.header["spp"]
         about = {"take": name, "frames": shard.references, "histories": len(shots), "spp": spp}
         for place in tiles(shard.size):
