@@ -388,6 +388,21 @@ def test_a_part_that_lacks_new_takes_is_packed_again(packed: Path, tmp_path: Pat
     with np.load(part, allow_pickle=False) as arrays:
         index = json.loads(arrays["about"].tobytes())["index"]
     assert [take["take"] for take in index] == ["0", "1", "1", "2", "2"]
+    # A part of other code, which older parts do not name.
+    with np.load(part, allow_pickle=False) as arrays:
+        older = {name: arrays[name] for name in arrays.files if name != "key"}
+    np.savez(part, **older)
+    assert run("gpu/pack.py", tmp_path / "takes", "-o", packed).startswith(f"{part}: 3 takes")
+
+
+def test_parts_of_other_takes_and_folders_without_takes_are_refused(
+    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copyfile(packed / "part-00.npz", packed / "part-01.npz")
+    for takes, expected in (("takes", "part-01.npz: expected no part"), ("nowhere", "nowhere: expected takes")):
+        with pytest.raises(pytest.fail.Exception):
+            run("gpu/pack.py", tmp_path / takes, "-o", packed)
+        assert expected in capsys.readouterr().err
 
 
 def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path: Path) -> None:

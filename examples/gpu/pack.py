@@ -4,7 +4,7 @@
 
 Each take has passed the wrappers in front of the network: the radiance of its last frames is accumulated, once with the
 whole history and once with a shorter one. Values keep six bits of mantissa, so that a part has some fifty takes in 60
-MB. A part that has the same takes already is not written again.
+MB. A part that the same takes and code have made already is not written again.
 """
 
 import argparse
@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcdenoise.data.files import atomic_path
-from mcdenoise.data.shards import Shard
-from mcdenoise.errors import run_script
+from mcdenoise.data.shards import Shard, find_shards
+from mcdenoise.errors import InputError, run_script
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
 from mcdenoise.models.wild import _background
+from mcdenoise.train.cache import _code, _digest
 from mcdenoise.train.data import describe_takes, open_takes
 from mcdenoise.train.footage import shots_of
 from mcdenoise.train.front import Front, split
@@ -70,7 +71,7 @@ def part_of(shot: dict[str, Tensor], names: tuple[str, ...], place: tuple[slice,
     return np.concatenate([shot[name][:, :, *place].numpy() for name in names], 1, dtype=np.float16)
 
 
-def written(shards: list[Shard], front: Front, path: Path) -> None:
+def written(shards: list[Shard], front: Front, path: Path, key: str) -> None:
     """Write a part."""
     fixed, history, index = list[NDArray[np.float16]](), list[NDArray[np.float16]](), list[dict[str, object]]()
     for shard in shards:
@@ -78,20 +79,23 @@ def written(shards: list[Shard], front: Front, path: Path) -> None:
         shots = [seen(shot.read()) for shot in shots_of(shard, *handed, start_every=1)[0]]
         name, spp = shard.path.name.partition(".")[0], shard.header["spp"]
         about = {"take": name, "frames": shard.references, "histories": len(shots), "spp": spp}
-        for place in tiles(shard.size):
+        places = [*tiles(shard.size)]
+        if not places:
+            raise InputError(f"{shard.path}: expected height and width of at least {TILE} pixels, found {shard.size}")
+        for place in places:
             index.append(about)
             fixed.append(part_of(shots[0], FIXED, place))
             history += [part_of(shot, HISTORY, place) for shot in shots]
     text = np.frombuffer(json.dumps({"index": index, **describe_takes(shards)}).encode(), np.uint8)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, about=text, **planes("fixed", fixed), **planes("history", history))
+        np.savez_compressed(file, about=text, key=np.array(key), **planes("fixed", fixed), **planes("history", history))
     print(f"{path}: {len(shards)} takes, {path.stat().st_size / 1e6:.1f} MB", flush=True)
 
 
-def checksum(path: Path) -> str:
-    """That of the takes of a part."""
+def key_of(path: Path) -> str:
+    """What a part was made from; empty if it does not say so."""
     with np.load(path, allow_pickle=False) as part:
-        return str(json.loads(part["about"].tobytes())["sha256"])
+        return str(part["key"]) if "key" in part.files else ""
 
 
 def main() -> None:
@@ -103,11 +107,19 @@ def main() -> None:
     options = parser.parse_args()
     front, _ = split(create_model(options.model))
     options.out.mkdir(parents=True, exist_ok=True)
-    shards = open_takes(options.takes)
-    for first in range(0, len(shards), options.size):
-        path, own = options.out / f"part-{first // options.size:02}.npz", shards[first : first + options.size]
-        if not (path.exists() and checksum(path) == describe_takes(own)["sha256"]):
-            written(own, front, path)
+    for folder in (folder for folder in options.takes if not find_shards(folder)):
+        raise InputError(f"{folder}: expected takes, found none")
+    shards, made = open_takes(options.takes), [front.settings, _code(), Path(__file__).read_text("utf-8")]
+    parts = {
+        options.out / f"part-{first // options.size:02}.npz": shards[first : first + options.size]
+        for first in range(0, len(shards), options.size)
+    }
+    for path in sorted(set(options.out.glob("part-*.npz")) - parts.keys()):
+        raise InputError(f"{path}: expected no part beside those of these takes, found it; remove it")
+    for path, own in parts.items():
+        key = _digest([*made, describe_takes(own)])
+        if not (path.exists() and key_of(path) == key):
+            written(own, front, path, key)
 
 
 if __name__ == "__main__":
