@@ -405,7 +405,9 @@ def test_parts_of_other_takes_and_folders_without_takes_are_refused(
         assert expected in capsys.readouterr().err
 
 
-def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path: Path) -> None:
+def test_training_for_seconds_ends_with_weights_and_a_log(
+    packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     recipe = tmp_path / "recipe.toml"
     recipe.write_text('[train]\nmodel = "wild_small"\ncrop = 32\nlamps = 0.5\nkey = 0.2\n[[data]]\nseeds = "0"\n')
     options = ("--recipe", recipe, "--seconds", "4", "--clips", "2", "--device", "cpu", "--validation", packed)
@@ -417,8 +419,17 @@ def test_training_for_seconds_ends_with_weights_and_a_log(packed: Path, tmp_path
     assert set(last["takes"]) == {"0", "1"}
     assert "Ann, CC0" in describe_weights(Path(weights))["data"]
     # The same command again has no seconds left, and makes no step.
+    checkpoint = tmp_path / "out" / "run.pt"
+    kept = torch.load(checkpoint, weights_only=True)
+    torch.save(kept | {"commits": [{"first_step": 0, "commit": "earlier"}]}, checkpoint)
     run("gpu/train.py", packed, "-o", tmp_path / "out", *options)
     assert json.loads((tmp_path / "out" / "log.jsonl").read_text().splitlines()[-1])["step"] == last["step"]
+    # Each step keeps the commit that made it.
+    commits = json.loads(describe_weights(Path(weights))["commits"])
+    assert [(each["first_step"], each["commit"] == "earlier") for each in commits] == [(0, True), (last["step"], False)]
+    with pytest.raises(pytest.fail.Exception):
+        run("gpu/train.py", packed, "-o", tmp_path / "out", *options[:-1], "0.25")
+    assert "config.json: expected kept=0.25 as in this run, found kept=0.5" in capsys.readouterr().err
 
 
 def test_only_what_weighs_the_history_learns_which_one_to_take(packed: Path, tmp_path: Path) -> None:

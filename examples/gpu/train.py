@@ -9,7 +9,7 @@ many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one, bu
 often as the square root of its number of frames: most takes have one sample. The learning rate follows the clock. The
 loss of a frame is the logarithm of its error, so that one with little noise counts as much as one with much: what is
 reported of a method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are
-written again at each validation. The same command goes on where an interrupted run was.
+written again at each validation. The same command goes on where an interrupted run was; another one is refused.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from mcdenoise.train.front import split
 from mcdenoise.train.loop import begun
 from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
-from mcdenoise.train.run_folder import about_weights
+from mcdenoise.train.run_folder import RunFolder, about_weights
 
 LOOKS, LOOK = 20, 20.0  # validations, and looks for new parts; but at least that many seconds apart
 WARM_UP = 200
@@ -254,7 +254,13 @@ class Run:
         self.optimizer = torch.optim.Adam(groups, config.learning_rate)
         self.rest, self.averaged = split(self.network)[1], split(self.average)[1]
         self.rounded = fastest_precision(self.device).precision == "bfloat16"
-        self.steps, self.passed = 0, 0.0
+        self.steps, self.passed, self.commits = 0, 0.0, list[dict[str, Any]]()
+        self.began()
+
+    def began(self) -> None:
+        """Note which source tree makes the steps from here on."""
+        if (commit := source_commit()) not in [each["commit"] for each in self.commits[-1:]]:
+            self.commits.append({"first_step": self.steps, "commit": commit})
 
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
         """Make a step at a part of the time."""
@@ -286,12 +292,13 @@ class Run:
         """Write a checkpoint."""
         parts = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer")}
         with atomic_path(path) as temporary:
-            torch.save({**parts, "steps": self.steps, "passed": self.passed}, temporary)
+            torch.save({**parts, **{name: getattr(self, name) for name in ("steps", "passed", "commits")}}, temporary)
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint, with other draws."""
         kept = torch.load(path, map_location=self.device, weights_only=True)
-        self.steps, self.passed = kept["steps"], kept["passed"]
+        self.steps, self.passed, self.commits = kept["steps"], kept["passed"], kept.get("commits", [])
+        self.began()
         for name in ("network", "average", "optimizer"):
             getattr(self, name).load_state_dict(kept[name])
         torch.manual_seed(self.config.seed + self.steps)
@@ -299,10 +306,10 @@ class Run:
 
     def save(self, path: Path, identity: dict[str, Any]) -> None:
         """Write the averaged weights, with a part of the first ones."""
-        commits = [{"first_step": 0, "commit": source_commit()}]
         config = asdict(replace(self.config, steps=self.steps))
         identity = identity | {"initial_weights": self.start["sha256"]}
-        about = about_weights(config, identity, self.steps, commits, self.start["data"]) | {"kept": str(self.kept)}
+        about = about_weights(config, identity, self.steps, self.commits, self.start["data"])
+        about |= {"kept": str(self.kept)}
         mean = copy.deepcopy(self.average)
         torch._foreach_lerp_(list(mean.parameters()), list(self.first.parameters()), self.kept)
         with atomic_path(path) as temporary:
@@ -329,7 +336,9 @@ def main() -> None:
     config = replace(chosen.config, batch=options.clips, frames=1, temporal_weight=0.0)
     run, tiles = Run(config, device, options.kept), Tiles(options.packed, device)
     watched = Tiles(options.validation, device) if options.validation else None
-    options.out.mkdir(parents=True, exist_ok=True)
+    # A resumed run would mix two runs, or mix its weights with other first ones.
+    own = {"kept": options.kept, "initial_weights": run.start["sha256"]}
+    RunFolder(options.out).claim(config=asdict(config) | own)
     names = (f"{config.model}.safetensors", "log.jsonl", "run.pt")
     weights, record, checkpoint = (options.out / name for name in names)
     log, losses, next_look = list[str](), list[Tensor](), 0.0
