@@ -30,6 +30,7 @@ import msgspec
 from msgspec import UNSET, Meta
 
 from mcdenoise.data.files import held, write_text, writing
+from mcdenoise.data.sequences import parse_frames
 from mcdenoise.data.shards import find_shards
 from mcdenoise.errors import InputError
 from mcdenoise.methods import check_names_no_code
@@ -96,12 +97,13 @@ class Rendering:
         place = self.folder(data)
         finished = place / "finished.json"
         with held(place, "rendering", wait=True), writing(place):
-            if not finished.exists():
+            if finished.exists() and self.name:
+                self._check_finished(finished)
+            # A damaged one is to be removed, and rendered again.
+            if not finished.exists() or len(_sequences(place)) < len(parse_frames(self.options.get("seeds", "0"))):
                 generate()
                 write_text(finished, json.dumps(dict(self.options), indent=2) + "\n")
-            elif self.name:
-                self._check_finished(finished)
-            sequences = find_shards(place) or sorted(path for path in place.iterdir() if path.is_dir())
+            sequences = _sequences(place)
             if self.clean:
                 out = place.with_name(f"{place.name}-clean")
                 sequences = [clean_references(sequence, out) for sequence in sequences]
@@ -119,6 +121,11 @@ class Rendering:
                 f"{self.where}: expected {finished.parent} rendered with {dict(self.options)}, found {found}; choose "
                 f"another folder, or remove {finished.name} to add to what is in it"
             )
+
+
+def _sequences(folder: Path) -> list[Path]:
+    """The takes or sequences in a folder."""
+    return find_shards(folder) or sorted(path for path in folder.iterdir() if path.is_dir())
 
 
 @dataclass(frozen=True)

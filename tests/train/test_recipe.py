@@ -108,9 +108,12 @@ def test_a_folder_with_a_name_is_of_the_options_that_it_was_rendered_with(tmp_pa
     message = refused(lambda: make("2"))
     assert "'seeds': '2'" in message
     assert "'seeds': '1'" in message
+    # One that was damaged, and removed.
+    (place / "random1").rmdir()
+    assert make("1") == [place / "random1"]
     (place / "finished.json").unlink()
     assert make("2") == [place / "random1", place / "random2"]
-    assert rendered == ["1", "2"]
+    assert rendered == ["1", "1", "2"]
 
 
 @pytest.mark.parametrize("recipe", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
