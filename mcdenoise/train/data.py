@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Sequential
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,7 @@ from mcdenoise.data.shards import Shard, find_shards, open_shard
 from mcdenoise.errors import InputError, level_of_caller
 from mcdenoise.frame import MOTION, tells_motion
 from mcdenoise.models import Needs
+from mcdenoise.reading import read_text
 from mcdenoise.train.clips import ClipSampler, check_sizes
 from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.footage import (
@@ -137,12 +138,17 @@ def open_takes(paths: Sequential[Path]) -> list[Shard]:
 def describe_takes(takes: Sequential[Shard]) -> dict[str, Any]:
     """What identifies the pixels of packed takes, and whom they are owed to."""
     digest = hashlib.sha256("".join(take.digest for take in takes).encode()).hexdigest()
-    owed = {str(line) for take in takes for line in take.header.get("credits", [])}
-    # Each line is a name with author and licence in parentheses.
-    authors = sorted({line.partition(" (")[2].rstrip(")") for line in owed})
-    return {"takes": len(takes), "sha256": digest, "credits": authors}
+    owed = (str(line) for take in takes for line in take.header.get("credits", []))
+    return {"takes": len(takes), "sha256": digest, "credits": _authors(owed)}
+
+
+def _authors(owed: Iterable[str]) -> list[str]:
+    """Authors and licences, which each line has in parentheses after a name."""
+    return sorted({line.partition(" (")[2].rstrip(")") for line in owed})
 
 
 def _describe(sequence: Sequence, sha256: str, **more: Any) -> dict[str, Any]:
-    size = f"{sequence.size[1]}x{sequence.size[0]}"
+    size, owed = f"{sequence.size[1]}x{sequence.size[0]}", sequence.root / "credits.txt"
+    if owed.is_file():
+        more["credits"] = _authors(read_text(owed).splitlines())
     return {"name": sequence.name, "frames": len(sequence), "size": size, **more, "sha256": sha256}

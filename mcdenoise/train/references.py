@@ -115,6 +115,8 @@ def clean_references(source: Path, out: Path) -> Path:
         shutil.rmtree(copied)
     ignored = shutil.ignore_patterns("reference*.exr", description.name, ".*")
     shutil.copytree(inputs, copied, ignore=ignored, dirs_exist_ok=True)
+    if (owed := source / "credits.txt").is_file():
+        shutil.copy(owed, copied.parent)
     for number in sequence.reference_numbers:
         frame, _ = sequence.frame(number).validate()
         if frame.reference is None:

@@ -238,7 +238,9 @@ def test_cleaned_references(small_sequence: Path, tmp_path: Path, place: str) ->
 
 def test_references_are_cleaned_anew_if_the_sequence_has_changed(small_sequence: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
+    (small_sequence / "credits.txt").write_text("chair (Ann, CC0)\n")
     copied = clean_references(small_sequence, tmp_path / "out")
+    assert (copied / "credits.txt").read_text() == "chair (Ann, CC0)\n"
     before = {path: path.stat().st_mtime_ns for path in copied.rglob("*")}
     assert clean_references(small_sequence, tmp_path / "out") == copied
     assert {path: path.stat().st_mtime_ns for path in copied.rglob("*")} == before

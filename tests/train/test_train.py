@@ -166,10 +166,13 @@ def take(path: Path, frames: int, references: int, without: str = "", repeated: 
     return path
 
 
-def test_weights_name_the_authors_of_packed_takes(tmp_path: Path) -> None:
+def test_weights_name_the_authors_of_packed_takes_and_of_sequences(small_sequence: Path, tmp_path: Path) -> None:
     config = TrainConfig(**{**SMALL, "steps": 1, "validation_frames": 0})
     weights = train(config, [take(tmp_path / "0.take.npz", 2, 2)], tmp_path / "run")
     assert json.loads(describe_weights(weights)["data"])[-1]["credits"] == ["Ann, CC-BY 3.0"]
+    (small_sequence / "credits.txt").write_text("sky (Bob, CC0)\n")
+    weights = train(config, [small_sequence], tmp_path / "other")
+    assert json.loads(describe_weights(weights)["data"])[-1]["credits"] == ["Bob, CC0"]
 
 
 @pytest.mark.parametrize(
