@@ -436,6 +436,7 @@ def test_only_what_weighs_the_history_learns_which_one_to_take(packed: Path, tmp
     run("gpu/choice.py", packed, "-o", tmp_path / "out", "--weights", "wild_small", "wild_large", "--steps", "20")
     learnt = [tmp_path / "out" / f"{name}.safetensors" for name in ("wild_small", "wild_large")]
     assert torch.equal(*(load_file(file)["trust.last.weight"] for file in learnt))
+    assert all("Ann, CC0" in describe_weights(file)["data"] for file in learnt)
     before, after = (
         dict(create_model("wild_small", **source).named_parameters())
         for source in ({"pretrained": True}, {"weights": learnt[0]})

@@ -118,10 +118,13 @@ def main() -> None:
         model = create_model(spelling.model, pretrained=spelling.weights is None, weights=spelling.weights).eval()
         (trust,) = (part for part in model.modules() if isinstance(part, Trust))
         if chosen is None:
-            data = tried(split(model)[1], trust, Tiles(options.packed, torch.device("cpu")))
+            tiles = Tiles(options.packed, torch.device("cpu"))
+            data = tried(split(model)[1], trust, tiles)
             learn(trust.requires_grad_(), data, options.steps)
             chosen = trust
         trust.load_state_dict(chosen.state_dict())
+        earlier = json.loads(about.get("data", "[]"))
+        about["data"] = json.dumps(earlier + [each for each in tiles.about if each not in earlier])
         about["choice"] = json.dumps({"steps": options.steps, "commit": source_commit()})
         architecture, settings = (about.pop(name) for name in ("architecture", "settings"))
         path = options.out / f"{spelling.model}.safetensors"
