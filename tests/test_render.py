@@ -17,7 +17,6 @@ from refusals import refused
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
-from mcdenoise.errors import InputError
 from mcdenoise.models import create_model
 from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
