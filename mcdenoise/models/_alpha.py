@@ -50,7 +50,8 @@ def noise_of_alpha(alpha: Tensor) -> Tensor:
 def without_noise(alpha: Tensor, noise: Tensor) -> Tensor:
     """The mean of the pixels around, as far as their patches of 3x3 pixels differ by noise only.
 
-    Where such a patch is all 0 or all 1, and where there is no noise, alpha stays.
+    Where there is no noise, alpha stays, and where such a patch is all 0 or all 1. These are not averaged with others:
+    what sparse alpha gave to them would be lost.
 
     Args:
         alpha: ``(B, 1, H, W)`` in [0, 1].
@@ -59,15 +60,17 @@ def without_noise(alpha: Tensor, noise: Tensor) -> Tensor:
     Source: Buades et al. 2005, "A non-local algorithm for image denoising".
     """
     mean = _mean(alpha)
-    patch = [tap / 3 for tap in taps(alpha, 3, "replicate")]
+    whole = (mean <= 0) | (mean >= 1)
+    # No patches differ as much as those of pixels that stay do from the others.
+    patches = torch.cat([*(tap / 3 for tap in taps(alpha, 3, "replicate")), 1e3 * whole], 1)
     variance = noise * mean * (1 - mean)
     # Noise alone makes patches differ by twice its variance, but no patch from itself.
     others = _SIDE**2 // 2
     logits = F.pad(alpha.new_full((1, 1, 1, 1), -1 / _FALLOFF**2), (0, 0, 0, 0, others, others))
     falloff = 1 / (2 * _FALLOFF**2 * variance + 1e-8)
     kernel = logits.expand(len(alpha), -1, *alpha.shape[-2:])
-    smooth = cross_bilateral_filter(alpha, kernel, [torch.cat(patch, 1)], [falloff], border="renormalize")
-    return torch.where((mean <= 0) | (mean >= 1) | (noise <= 0), alpha, smooth.clamp(0, 1))
+    smooth = cross_bilateral_filter(alpha, kernel, [patches], [falloff], border="renormalize")
+    return torch.where(whole | (noise <= 0), alpha, smooth.clamp(0, 1))
 
 
 def _mean(alpha: Tensor) -> Tensor:

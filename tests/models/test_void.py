@@ -162,6 +162,15 @@ def test_noise_of_alpha_falls_and_light_stays_its_pair(model: object, samples: i
     torch.testing.assert_close(output.layers["half"], output.image / 2, rtol=1e-3, atol=1e-5)
 
 
+def test_sparse_alpha_and_its_light_stay() -> None:
+    """What covers a fiftieth of each pixel leaves most patches of pixels empty: half of it was lost to those."""
+    alpha = (torch.rand(4, 1, 1, 48, 64, generator=torch.Generator().manual_seed(0)) < 0.02).float().mean(0)
+    output = Denoiser("noisy", alpha=True).output(Frame(alpha.expand(-1, 3, -1, -1), alpha=alpha))
+    assert not torch.equal(output.alpha, alpha)
+    assert float(output.alpha.mean()) == pytest.approx(float(alpha.mean()), rel=0.1)
+    assert float(output.image.mean()) == pytest.approx(float(alpha.mean()), rel=0.1)
+
+
 def test_a_glow_keeps_its_light_and_a_masked_pixel_its_alpha() -> None:
     true = covers("focus")
     drawn = torch.rand(4, *true.shape, generator=torch.Generator().manual_seed(0))
