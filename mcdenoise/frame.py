@@ -41,7 +41,7 @@ class Hints(NamedTuple):
         alone: there is no previous frame either.
         stages: the intermediate images are also requested.
         keep_all: nothing may be skipped, even if the scene does not need it.
-        alpha: the alpha is also to be denoised; otherwise it is ignored.
+        alpha: the alpha is also to be denoised, as the denoiser or the frame says; otherwise it is ignored.
     """
 
     still: bool = False

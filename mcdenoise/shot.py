@@ -46,7 +46,8 @@ class ShotSettings:
         output_layer: add the result as a layer of this name, and replace nothing.
         layers: layers of light to denoise with the same kernels as the color, so that they still add up: names or
             patterns, separated by spaces, such as DiffDir DiffInd or Combined_*; or all, those that add up to it.
-        alpha: also denoise the alpha, so that the color stays a pair with it; otherwise it is not changed.
+        alpha: also denoise the alpha, so that the color stays a pair with it; otherwise it is not changed, unless the
+            color is not multiplied by it, as in a PNG.
         wrap: the frames are panoramas of 360 degrees, whose left and right borders are one; cameras are not used.
         alpha_min: smallest weight of the current frame in the accumulation, in (0, 1]; the model's own by default.
         anti_lag: discard history where the light has changed.

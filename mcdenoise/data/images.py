@@ -100,6 +100,7 @@ class Part:
         integers: channels that are stored as integers, such as object ids.
         display_referred: whether the pixels are display values, as in an 8-bit PNG.
         gamma: exponent of the display curve, if it is a power; 0 for the curve of sRGB.
+        straight: whether the colors are not multiplied by their alpha, as in a PNG.
     """
 
     name: str
@@ -109,6 +110,7 @@ class Part:
     integers: frozenset[str] = frozenset()
     display_referred: bool = False
     gamma: float = 0.0
+    straight: bool = False
 
 
 @dataclass(frozen=True)
@@ -379,7 +381,8 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         window = Window(spec.y, spec.x, spec.y + spec.height, spec.x + spec.width)
         whole = Window(spec.full_y, spec.full_x, spec.full_y + spec.full_height, spec.full_x + spec.full_width)
         gamma = gamma or 0.0 if display else 0.0
-        parts.append(Part(part_name, window, whole, channels, integers, display, gamma))
+        straight = len(channels) > 3 and bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
+        parts.append(Part(part_name, window, whole, channels, integers, display, gamma, straight))
         if name != "openexr":
             break
     pending_error(file)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.data.exr import write_image
-from mcdenoise.data.images import FORMATS, Image
+from mcdenoise.data.images import FORMATS, Image, Part
 from mcdenoise.errors import InputError
 
 # Type of the stored numbers; those of whole numbers are display values.
@@ -42,6 +42,15 @@ def write_radiance(path: Path, image: Image) -> float:
         spec.attribute("oiio:ColorSpace", "sRGB")
     write_image(path, spec, np.asarray(image, np.float32))
     return clamped
+
+
+def light_of(pixels: Image, part: Part) -> Image:
+    """Convert stored colors ``(..., C)`` to linear light that is multiplied by its alpha, the fourth channel."""
+    if not (part.display_referred or part.straight):
+        return pixels
+    color, rest = pixels[..., :3], pixels[..., 3:]
+    color = decode(color, part.gamma) if part.display_referred else color
+    return np.concatenate([color * rest[..., :1] if part.straight and rest.size else color, rest], -1)
 
 
 def decode(pixels: Image, gamma: float = 0.0) -> Image:

@@ -279,7 +279,7 @@ class Denoiser:
                     raise InputError("frame: expected tensors with values, found those of the device meta, without any")
                 given, dtype = frame, dtype_of(frame, self.model, differentiable=self.differentiable)
                 hints = Hints(last=self._is_last(), alone=self._frames == 1, stages=stages)
-                hints = hints._replace(keep_all=self.keep_all, alpha=self.alpha)
+                hints = hints._replace(keep_all=self.keep_all, alpha=self.alpha or frame.hints.alpha)
                 whole = frame.to(self.device).to(dtype).replace(hints=hints)
                 whole = wrapped(whole) if self.wrap else whole
                 frame, void = prepared(whole, report, self._doubt)

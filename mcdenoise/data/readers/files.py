@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
 from mcdenoise.data.images import EXR_SUFFIXES, Image, Mask, Metadata, Part, Window, read_image_header
-from mcdenoise.data.radiance import decode
+from mcdenoise.data.radiance import light_of
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.choice import Choice
 from mcdenoise.data.readers.diffuse_specular import NO_SPLIT, Split
@@ -28,7 +28,7 @@ from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
-from mcdenoise.frame import BUFFERS, Frame, scale_samples
+from mcdenoise.frame import BUFFERS, Frame, Hints, scale_samples
 from mcdenoise.motion import USUAL_MOTION, Convention, convert
 
 # Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
@@ -292,7 +292,9 @@ class RenderedFiles(FrameSequence):
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
         if seen is not None:
             buffers["depth"] = as_tensor(np.where(seen, images["depth"], np.inf))
-        return Frame(**buffers, layers={name: as_tensor(radiance) for name, radiance in lights.items()})
+        # They are the ratio of light and alpha, which only both together can keep.
+        hints = Hints(alpha=self.part_of(self.choice.layers["color"]).straight)
+        return Frame(**buffers, layers={name: as_tensor(light) for name, light in lights.items()}, hints=hints)
 
     def known(self, images: Mapping[str, Image]) -> Mask:
         """``(H, W)`` true where something was hit: by the depth, or without one by the position."""
@@ -374,9 +376,7 @@ class RenderedFiles(FrameSequence):
                 f"{self.file(layer, number)}: expected {width} x {height} pixels like the first color file, found "
                 f"{found_width} x {found_height}; render all buffers and frames at one size"
             )
-        if self.part_of(layer).display_referred and layer not in others:
-            pixels = np.concatenate([decode(pixels[..., :3], self.part_of(layer).gamma), pixels[..., 3:]], -1)
-        return pixels
+        return pixels if layer in others else light_of(pixels, self.part_of(layer))
 
 
 def _without_lossy_black(radiance: Image) -> Image:

@@ -24,7 +24,7 @@ from mcdenoise.data.images import (
     read_channels,
     read_image_header,
 )
-from mcdenoise.data.radiance import decode
+from mcdenoise.data.radiance import light_of
 from mcdenoise.data.readers.choice import Choice, choose
 from mcdenoise.data.readers.diffuse_specular import (
     DIFFUSE,
@@ -140,9 +140,9 @@ class Result:
         Raises:
             InputError: the file is damaged.
         """
-        pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:3]})[self.layer.part]
+        pixels = read_channels(self.path, {self.layer.part: self.layer.channels[:4]})[self.layer.part]
         pixels = np.repeat(pixels, 3, -1) if pixels.shape[2] == 1 else pixels
-        pixels = decode(pixels, self.part.gamma) if self.part.display_referred else pixels
+        pixels = light_of(pixels, self.part)[..., :3]
         pixels = pixels if window is None else window.of(pixels, self.part.window)
         image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
         return image, read_image_header(self.path).metadata
@@ -261,9 +261,8 @@ def _some_pixels(shot: RenderedFiles, number: int, layers: Sequence[Layer]) -> d
     for top in np.linspace(0, max(0, height - _STRIP), _STRIPS).astype(int).tolist():
         strips = read_files(lambda layer: shot.file(layer, number), same, slice(top, top + _STRIP))
         for layer, pixels in strips.items():
-            part, image = shot.part_of(layer), pixels[:, :: max(1, width // _COLUMNS), :3]
-            image = image.reshape(-1, image.shape[-1])
-            found[layer].append(decode(image, part.gamma) if part.display_referred else image)
+            image = light_of(pixels[:, :: max(1, width // _COLUMNS)], shot.part_of(layer))[..., :3]
+            found[layer].append(image.reshape(-1, image.shape[-1]))
     return {layer: np.concatenate(strips) for layer, strips in found.items()}
 
 

@@ -144,11 +144,19 @@ def _write_picture(source: Path, target: Path, replaced: Mapping[str, Image], st
     """Write a file with one picture, with its other channels and its pixel type unchanged."""
     spec, header, pixels = read_picture(source)
     stored = stored or header.parts[0]
-    for place, name in enumerate(header.parts[0].channels):
+    names = header.parts[0].channels
+    # Of what is not there, the color stays.
+    there = np.ones_like(pixels[..., 0])
+    if stored.straight:
+        there = replaced.get(names[spec.alpha_channel], pixels[..., spec.alpha_channel])
+    for place, name in enumerate(names):
         if name in replaced:
             image = replaced[name]
-            display = stored.display_referred and name.lower() not in ("a", "alpha")
-            pixels[..., place] = encode(image[..., None], stored.gamma)[..., 0] if display else image
+            if place != spec.alpha_channel:
+                image = np.divide(image, there, out=np.zeros_like(image), where=there > 0)
+                image = encode(image[..., None], stored.gamma)[..., 0] if stored.display_referred else image
+                image = np.where(there > 0, image, pixels[..., place])
+            pixels[..., place] = image
     write_image(target, spec, pixels)
 
 

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import torch
 from commands import run
 from pictures import save
 
 from mcdenoise.data import open_sequence
+from mcdenoise.data.readers.opening import open_result
 
 Image = np.ndarray[Any, Any]
 SIZE = (12, 16)
@@ -151,3 +153,34 @@ def test_the_color_in_another_space_is_written_too(names: str, tmp_path: Path) -
     for name, image in channels.items():
         expected = image if name == "A" or name.startswith("other") else image * 0.5
         np.testing.assert_allclose(pixels[name], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_colors_that_are_not_multiplied_by_alpha_are_light_that_is(name: str, tmp_path: Path) -> None:
+    """What a transparent pixel hides is no light, and stays in the file."""
+    random = np.random.default_rng(0)
+    alpha = np.repeat([0.0, 0.25, 1.0], 4)[:, None] * np.ones(SIZE)
+    channels = {each: random.uniform(0.1, 0.9, SIZE) for each in "RGB"} | {"A": alpha}
+    path = save(tmp_path / name, channels, "uint16", oiio__UnassociatedAlpha=1)
+    before, sequence = stored(path), open_sequence(path)
+    color = sequence.frame(0).color[0].movedim(0, -1).numpy()
+    np.testing.assert_allclose(color, srgb(before[..., :3]) * before[..., 3:], rtol=3e-3, atol=1e-5)
+    (tmp_path / "out").mkdir()
+    halved = before[..., 3:].astype(np.float32) / 2
+    result = sequence.write(tmp_path / "out", 0, color / 2, alpha=halved)
+    after = stored(result)
+    np.testing.assert_allclose(after[..., 3:], halved, atol=1e-5)
+    np.testing.assert_allclose(after[..., :3], before[..., :3], rtol=2e-3, atol=1e-5)
+    np.testing.assert_allclose(open_result(result).read()[0][0].movedim(0, -1), color / 2, rtol=5e-3, atol=1e-5)
+
+
+def test_straight_colors_stay_the_same_to_the_rim(tmp_path: Path) -> None:
+    rows, columns = np.mgrid[:32, :32] - 15.5
+    alpha = np.clip(10 - np.hypot(rows, columns), 0, 1)
+    channels = {each: np.where(alpha > 0, 0.1 * place, 1) for place, each in enumerate("RGB", 1)} | {"A": alpha}
+    path = save(tmp_path / "a.png", channels, "uint16", oiio__UnassociatedAlpha=1, oiio__ColorSpace="Linear")
+    run("denoise", path, "-o", tmp_path / "out.png", "--model", "joint_bilateral", "--threads", "1")
+    before, after = (open_sequence(each).frame(0) for each in (path, tmp_path / "out.png"))
+    assert before.alpha is not None
+    torch.testing.assert_close(after.alpha, before.alpha)
+    torch.testing.assert_close(after.color, before.color, rtol=1e-2, atol=1e-4)
