@@ -356,11 +356,11 @@ def check_apart(sequence: Sequence, out: Path) -> None:
         raise InputError(
             f"{out}: expected another folder than that of the input, found the same; choose one to write to"
         )
-    for path in filter(Path.is_symlink, listed(out)):
+    for path in listed(out):
         target = os.path.realpath(path)
-        if {target, os.path.dirname(target)} & inputs:
+        if (path.is_file() and target in inputs) or (path.is_symlink() and {target, os.path.dirname(target)} & inputs):
             raise InputError(
-                f"{path}: expected no link to an input, which would be written to, found one; remove it, or choose "
+                f"{path}: expected no input, nor a link to an input, which would be written to, found one; choose "
                 "another folder"
             )
 

@@ -194,7 +194,7 @@ def test_an_output_that_is_a_link_to_an_input_is_refused(
     out.mkdir()
     (out / name).symlink_to(inputs / target)
     before = {path.name: path.read_bytes() for path in inputs.iterdir()}
-    assert "expected no link to an input" in refused(
+    assert "a link to an input" in refused(
         lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
     )
     assert {path.name: path.read_bytes() for path in inputs.iterdir()} == before
@@ -207,7 +207,18 @@ def test_an_output_that_is_a_link_to_what_an_input_links_to_is_refused(small_seq
     color.symlink_to(tmp_path / "elsewhere.exr")
     out.mkdir()
     (out / "denoised2.exr").symlink_to(tmp_path / "elsewhere.exr")
-    assert "expected no link to an input" in refused(
+    assert "a link to an input" in refused(
+        lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
+    )
+
+
+def test_the_folder_that_the_links_of_the_input_lead_to_is_refused(small_sequence: Path, tmp_path: Path) -> None:
+    """The files there, which have the names of the results, would be replaced."""
+    color, out = small_sequence / "inputs" / "color2.exr", tmp_path / "out"
+    out.mkdir()
+    color.rename(out / "denoised2.exr")
+    color.symlink_to(out / "denoised2.exr")
+    assert "denoised2.exr: expected no input" in refused(
         lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
     )
 
