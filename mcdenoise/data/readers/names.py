@@ -18,7 +18,8 @@ from mcdenoise.errors import InputError
 _OIDN = re.compile(r"(?P<name>.+?)_(?P<samples>[0-9]{1,9})spp\.(?P<buffer>hdr|ldr|alb|nrm|z)", re.IGNORECASE)
 _PLACEHOLDER = re.compile(r"#+|%0?[0-9]*d")
 # A minus sign counts only if no word precedes it: in `shot_-0002`, but not in `shot-0002`.
-_DIGITS = re.compile(r"((?:(?<=[_. ])-)?[0-9]{1,18})")
+_MINUS = "(?<=[_. ])-"
+_DIGITS = re.compile(f"((?:{_MINUS})?[0-9]{{1,18}})")
 
 
 @dataclass(frozen=True)
@@ -79,13 +80,13 @@ def _matches(pattern: Path) -> list[Path]:
     if not os.path.isdir(folder):
         raise InputError(f"{pattern}: expected files, found no folder {folder}; check the path")
     images = _images_in(folder)
-    # At least as many digits as there are hash marks, or as the format says.
+    # At least as many digits as there are hash marks, or as the format says, which counts a minus sign.
     digits = [each.count("#") or int(each.strip("%d") or 1) or 1 for each in pieces[1::2]]
     # Brackets may be part of a file name; they are placeholders only if no such file exists.
     for translated in (re.escape, _translated) if wild else (re.escape,):
         texts = iter([translated(each) for each in pieces[::2]])
         expression = next(texts) + "".join(
-            f"[0-9]{{{least},9}}{text}" for least, text in zip(digits, texts, strict=True)
+            f"(?:[0-9]|{_MINUS}){{{least},9}}{text}" for least, text in zip(digits, texts, strict=True)
         )
         if found := [path for path in images if re.fullmatch(expression, path.name)]:
             return found

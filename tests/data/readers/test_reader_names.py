@@ -73,6 +73,14 @@ def test_which_digits_count_the_frames(names: list[str], expected: dict[str, lis
     )
 
 
+def test_patterns_have_negative_numbers_too(image: Callable[..., list[Path]], tmp_path: Path) -> None:
+    """`%04d` counts the minus sign as a digit, Blender does not."""
+    names = ["shot.-0002.exr", "shot.-001.exr", "shot.0000.exr"]
+    image(*names, "shot-0003.exr", "shot.-01.exr")
+    for pattern in ("shot.####.exr", "shot.%04d.exr"):
+        assert [path.name for path in find_files([tmp_path / pattern])] == names
+
+
 def test_two_files_of_a_frame_are_refused() -> None:
     message = refused(group_files, [D / "shot_0001.exr", D / "shot_1.exr"])
     assert "shot_1.exr: expected one file a frame, found shot_0001.exr as well" in message
