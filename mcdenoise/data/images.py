@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -384,6 +385,9 @@ def _header(path: Path, file: oiio.ImageInput, name: str) -> ImageHeader:
         straight = len(channels) > 3 and bool(spec.get_int_attribute("oiio:UnassociatedAlpha"))
         parts.append(Part(part_name, window, whole, channels, integers, display, gamma, straight))
         if name != "openexr":
+            if file.seek_subimage(1, 0):
+                # The text is the same for all frames, so that it is told once.
+                warnings.warn("a file has several images: only the first is read and written", stacklevel=2)
             break
     pending_error(file)
     if not parts:

@@ -184,3 +184,16 @@ def test_straight_colors_stay_the_same_to_the_rim(tmp_path: Path) -> None:
     assert before.alpha is not None
     torch.testing.assert_close(after.alpha, before.alpha)
     torch.testing.assert_close(after.color, before.color, rtol=1e-2, atol=1e-4)
+
+
+def test_a_picture_of_several_pages_is_told(tmp_path: Path) -> None:
+    """A result has the first one only."""
+    output, specs = oiio.ImageOutput.create("tiff"), [oiio.ImageSpec(*SIZE[::-1], 3, "float")] * 2
+    assert output.open(str(tmp_path / "a.tif"), specs)
+    assert output.write_image(np.ones((*SIZE, 3), np.float32))
+    assert output.open(str(tmp_path / "a.tif"), specs[1], "AppendSubimage")
+    assert output.write_image(np.zeros((*SIZE, 3), np.float32))
+    assert output.close()
+    with pytest.warns(UserWarning, match="several images"):
+        color = open_sequence(tmp_path / "a.tif").frame(0).color
+    assert torch.equal(color, torch.ones_like(color))
