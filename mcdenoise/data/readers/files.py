@@ -249,7 +249,10 @@ class RenderedFiles(FrameSequence):
         """A frame of stored images, which are converted to this package's conventions."""
         color = images["color"]
         if color.shape[2] > 3:
-            images.setdefault("alpha", np.clip(color[..., 3:4], 0, 1))
+            images.setdefault("alpha", color[..., 3:4])
+        if "alpha" in images:
+            # A pixel filter may have negative lobes, and a sample that is NaN has hit something.
+            images["alpha"] = np.clip(np.nan_to_num(images["alpha"], nan=1), 0, 1)
         images["color"] = _without_lossy_black(color[..., :3])
         if "mask" in images:
             # A matte of an object is called a mask, too: beside it there is light.
