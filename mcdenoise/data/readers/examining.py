@@ -285,8 +285,8 @@ def examine_parts(
 
 
 def _light(*images: Image) -> float:
-    """The sum of all values but NaN."""
-    return sum(float(np.nansum(image, dtype=np.float64)) for image in images)
+    """The sum of all finite values."""
+    return sum(float(image[np.isfinite(image)].sum(dtype=np.float64)) for image in images)
 
 
 def _span(values: Image) -> str:

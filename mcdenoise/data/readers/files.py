@@ -254,6 +254,9 @@ class RenderedFiles(FrameSequence):
             # A pixel filter may have negative lobes, and a sample that is NaN has hit something.
             images["alpha"] = np.clip(np.nan_to_num(images["alpha"], nan=1), 0, 1)
         images["color"] = _without_lossy_black(color[..., :3])
+        # Where a sample was NaN, the color is filled from around.
+        for name in {"variance", "roughness"} & images.keys():
+            images[name] = np.nan_to_num(images[name], nan=0, posinf=0, neginf=0)
         if "mask" in images:
             # A matte of an object is called a mask, too: beside it there is light.
             images["mask"] = np.where((images["color"] > 0).any(-1, keepdims=True), 1, images["mask"] > 0).astype(

@@ -351,12 +351,14 @@ def test_a_shot_that_fades_in_is_read_by_a_frame_that_shows_something(black: int
 
 
 @pytest.mark.parametrize("names", ["RGBA", ("Ci.r", "Ci.g", "Ci.b", "a")])
-def test_alpha_of_pixel_filters_and_of_bad_samples_is_read(names: Sequence[str], tmp_path: Path) -> None:
+def test_alpha_of_pixel_filters_and_bad_samples_of_all_buffers_are_read(names: Sequence[str], tmp_path: Path) -> None:
     """Lobes of a filter are negative at an edge, and a sample that is NaN is so in all channels."""
     pixels = np.full((8, 12), 0.5, np.float32)
     pixels[2, 3:6] = np.nan, -0.02, 1.05
-    sequence = open_sequence(save(tmp_path / "a.exr", dict.fromkeys(names, pixels)))
+    others = {"roughness": np.clip(pixels, 0, 1), "variance": np.where(pixels < 0, np.inf, pixels)}
+    sequence = open_sequence(save(tmp_path / "a.exr", dict.fromkeys(names, pixels) | others))
     found = sequence.frame(0)
     assert found.alpha is not None
+    assert {"roughness", "variance"} <= found.buffers
     assert found.alpha[0, 0, 2, 3:6].tolist() == [1, 0, 1]
     found.inspect()
