@@ -172,7 +172,6 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
         The layers of parts of the light and of samples that every frame has, with the data window of the color.
     """
     color = shot.choice.layers["color"]
-    main = shot.part_of(color)
     for name, layer in sorted(shot.choice.layers.items()):
         missing = [number for number in shot.numbers if not shot.has(layer, number)]
         if missing and name != "reference":
@@ -193,7 +192,7 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
         parts = {each: headers[each.group].part(each.part) for each in (*used, *everywhere) if each.group in headers}
         window = parts[color].window
         for layer in (each for each in used if each in parts):
-            _check_window(shot.file(layer, number), parts[layer], layer, main, shot.one_window)
+            _check_part(shot, number, layer, parts[layer])
             if layer == shot.choice.layers.get("reference") and parts[layer].window != window:
                 raise InputError(
                     f"{shot.file(layer, number)}: expected a reference in the data window of the color, found another; "
@@ -209,9 +208,15 @@ def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLa
     return everywhere
 
 
-def _check_window(path: Path, part: Part, layer: Layer, main: Part, one_window: bool) -> None:
+def _check_part(shot: RenderedFiles, number: int, layer: Layer, part: Part) -> None:
+    path, first, main = shot.file(layer, number), shot.part_of(layer), shot.part_of(shot.choice.layers["color"])
     check_channels(path, part.channels, layer.channels)
-    if part.window != main.window and (one_window or part.display != main.display):
+    if part.name != first.name and len(shot.parts[layer.group]) > 1:
+        raise InputError(
+            f"{path}: expected '{first.name}' as part {layer.part + 1}, as the first file has it, found '{part.name}'; "
+            "render all frames with the same layers"
+        )
+    if part.window != main.window and (shot.one_window or part.display != main.display):
         raise InputError(
             f"{path}: expected {_window(main)} like the first color file, found {_window(part)}; render all "
             "buffers and frames at one size, or crop them in one display window, or leave a buffer out with --map"

@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 from commands import refuses
-from pictures import save
+from pictures import part_of, save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
@@ -246,6 +247,16 @@ def test_layers_of_no_known_name_are_told_by_their_values(rendered: Path, tmp_pa
     assert sources["position"] == "a.exr second.XYZ"
     # The user's exclusion takes precedence.
     assert "normal" not in open_sequence(tmp_path / "a.exr", mapping=["normal="]).buffers
+
+
+def test_parts_in_another_order_are_refused(tmp_path: Path) -> None:
+    """They have the same channels, and the albedo would be denoised as the image."""
+    pixels = dict.fromkeys("RGB", np.ones(SIZE, np.float32))
+    for number, order in enumerate((("rgba", "albedo"), ("albedo", "rgba"))):
+        OpenEXR.File([part_of(pixels, name) for name in order]).write(str(tmp_path / f"a.{number}.exr"))
+    message = refused(open_sequence, tmp_path)
+    assert "a.1.exr: expected 'rgba' as part 1" in message
+    assert "found 'albedo'" in message
 
 
 def test_no_radiance_at_all(tmp_path: Path) -> None:
