@@ -152,7 +152,9 @@ def _made(images: Sequence[str], quality: Quality, clean: bool) -> OidnOpen | Fe
     """The network that the library uses for these images, without its weights."""
     if images[0] != "color":
         return FeatureFilter(images[0], "large" if quality == "high" else "base")
-    return OidnOpen("small" if quality == "fast" else "large" if quality == "high" and clean else "base", images[1:])
+    # Its large network is for a color with both features.
+    large = quality == "high" and clean and len(images) == len(_IMAGES)
+    return OidnOpen("small" if quality == "fast" else "large" if large else "base", images[1:])
 
 
 def _run(network: Any, images: Mapping[str, Any]) -> Tensor:
