@@ -115,4 +115,5 @@ def _is_method(thing: object) -> bool:
 
 
 def _stage(method: Any, name: str) -> str:
-    return "network" if isinstance(method, Oidn) or next(method.parameters(), None) is not None else name
+    has_weights = isinstance(method, Oidn) or next(method.parameters(), None) is not None
+    return getattr(method, "stage", "network" if has_weights else name)

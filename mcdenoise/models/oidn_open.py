@@ -23,7 +23,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State, prepared
 from mcdenoise.models._tza import Archive, archives_in, read_tza
 from mcdenoise.models.oidn import Filters, Oidn, Quality, library_of_oidn
 from mcdenoise.models.tiled import Tiled
-from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
+from mcdenoise.nn.oidn import FeatureFilter, OidnUNet, Size, oidn_exposure
 from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
 
 _FEATURES = ("albedo", "normal")
@@ -79,31 +79,6 @@ def load_archive(unet: OidnUNet, archive: Archive, where: str) -> None:
                 raise InputError(f"{where}: '{name}': expected weights of shape {own}, found {tuple(weight.shape)}")
             layer.weight.copy_(weight)
             layer.bias.copy_(archive[f"{name}.bias"])  # type: ignore[union-attr]
-
-
-class FeatureFilter(nn.Module):
-    """The network for a single feature, from noisy to clean.
-
-    Args:
-        name: "albedo" or "normal".
-        size: see :class:`mcdenoise.nn.oidn.OidnUNet`; the library has "base" and "large".
-    """
-
-    def __init__(self, name: str, size: Size = "base") -> None:
-        super().__init__()
-        self.name = name
-        self.unet = OidnUNet(3, size)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """Filter ``(B, 3, H, W)``: an albedo on the scale of sRGB, a normal from -1 to 1."""
-        # All of kornia comes with it, which takes as long to import as a single frame to denoise.
-        from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-
-        if self.name == "albedo":
-            clean: Tensor = rgb_to_linear_rgb(self.unet(linear_rgb_to_rgb(image.clamp(0, 1))).clamp(0, 1))
-        else:
-            clean = 2 * self.unet(image.clamp(-1, 1) * 0.5 + 0.5).clamp(0, 1) - 1
-        return clean.to(image.dtype)
 
 
 class OpenFilters(Filters):

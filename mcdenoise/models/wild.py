@@ -23,6 +23,7 @@ from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
+from mcdenoise.models.filtered import Features, Filtered
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
@@ -199,6 +200,7 @@ def _wild(
     alpha_min: float = 0.03,
     anti_lag: bool = True,
     tolerance: float = TOLERANCE,
+    features: Features | None = None,
 ) -> Model:
     """The network behind its history.
 
@@ -207,6 +209,9 @@ def _wild(
         alpha_min: smallest weight of a frame in the accumulated radiance, see :class:`mcdenoise.models.Accumulated`.
         anti_lag: whether the history is shortened where the light has changed, see :func:`mcdenoise.ops.history_lag`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
+        features: whether albedo and normal are noisy and to be denoised first, see
+            :class:`mcdenoise.models.filtered.Filtered`; by default "auto" for the large network, and "clean" for the
+            others, whose time it would take several times.
 
     Raises:
         InputError: a setting is out of its range.
@@ -214,7 +219,10 @@ def _wild(
     model = Skipping(Tiled(WildNetwork(size)), tolerance, alpha_min)
     threshold = THRESHOLD if anti_lag else math.inf
     # Clamped fireflies are light that the network would have to guess: stills had a tenth more error.
-    return Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
+    made = Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
+    if features is None:
+        features = "auto" if size == "large" else "clean"
+    return made if features == "clean" else Filtered(made, features)
 
 
 for _name, _size, _cost in (

@@ -127,6 +127,31 @@ class OidnUNet(nn.Module):
         return corner(convolved_in_float32(x, self.last), height, width)
 
 
+class FeatureFilter(nn.Module):
+    """The network for a single feature, from noisy to clean.
+
+    Args:
+        name: "albedo" or "normal".
+        size: see :class:`OidnUNet`; the library has "base" and "large".
+    """
+
+    def __init__(self, name: str, size: Size = "base") -> None:
+        super().__init__()
+        self.name = name
+        self.unet = OidnUNet(3, size)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Filter ``(B, 3, H, W)``: an albedo on the scale of sRGB, a normal from -1 to 1."""
+        # All of kornia comes with it, which takes as long to import as a single frame to denoise.
+        from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+        if self.name == "albedo":
+            clean: Tensor = rgb_to_linear_rgb(self.unet(linear_rgb_to_rgb(image.clamp(0, 1))).clamp(0, 1))
+        else:
+            clean = 2 * self.unet(image.clamp(-1, 1) * 0.5 + 0.5).clamp(0, 1) - 1
+        return clean.to(image.dtype)
+
+
 def _block(in_channels: int, widths: tuple[int, ...]) -> ConvBlock:
     layers: list[nn.Module] = []
     for entering, leaving in itertools.pairwise([in_channels, *widths]):

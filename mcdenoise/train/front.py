@@ -1,4 +1,4 @@
-"""The front of a model: its outer wrappers without weights, which are computed once and cached."""
+"""The front of a model: its outer wrappers, of which nothing is trained, which are computed once and cached."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import nn
 from mcdenoise.frame import RADIANCE, Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output, Restored, Skipping, State, Wrapper
 from mcdenoise.models.demodulated import remodulated
+from mcdenoise.models.filtered import FILTERED, Filtered
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn
 
 # Buffers that accumulation and Open Image Denoise provide, with their channels.
@@ -27,7 +28,8 @@ class Front:
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.
-        given: parts of the light that every frame has; they are cached as processed by the wrappers.
+        given: parts of the light, and features that a wrapper filters, that every frame has; they are cached as
+            processed by the wrappers.
     """
 
     wrappers: tuple[tuple[type[Wrapper], dict[str, Any]], ...] = ()
@@ -51,7 +53,8 @@ class Front:
 
     def of(self, buffers: Collection[str]) -> Front:
         """The same front for frames that all have these buffers."""
-        return replace(self, given=tuple(sorted(_PARTS & set(buffers))))
+        filtered = FILTERED if self._has(Filtered) else ()
+        return replace(self, given=tuple(sorted(_PARTS.union(filtered) & set(buffers))))
 
     @property
     def settings(self) -> list[Any]:
@@ -114,7 +117,7 @@ def split(model: Model) -> tuple[Front, Model]:
     wrappers: list[tuple[type[Wrapper], dict[str, Any]]] = []
     found, rest = 0, model
     # Exact types only, because derived classes may do anything.
-    while isinstance(model, Wrapper) and type(model) in (Demodulated, Accumulated, WithOidn):
+    while isinstance(model, Wrapper) and type(model) in (Filtered, Demodulated, Accumulated, WithOidn):
         wrappers.append((type(model), _settings(model)))
         model = model.inner
         if wrappers[-1][0] is not Demodulated:

@@ -537,9 +537,11 @@ def test_a_header_that_means_nothing_is_refused(weights: Path, key: str, value: 
 
 
 def test_shipped_weights_fix_the_settings_that_determine_them() -> None:
-    beside = "model 'wild': expected no settings but alpha_min, anti_lag, tolerance beside its weights, found "
+    beside = (
+        "model 'wild': expected no settings but alpha_min, anti_lag, tolerance, features beside its weights, found "
+    )
     for setting, value in (("quality", "high"), ("size", "small")):
-        message = refused(lambda own={setting: value}: create_model("wild", pretrained=True, **own))
+        message = refused(lambda given={setting: value}: create_model("wild", pretrained=True, **given))
         assert message.startswith(f"{beside}{setting}={value}; the weights fix size; ")
         assert message.endswith(": wild_large, wild_small")
     create_model("wild", pretrained=True, size="base")
@@ -580,7 +582,9 @@ def test_a_damaged_tensor_and_an_infinite_weight_are_refused(tmp_path: Path) -> 
     assert "NaN or infinite" in refused(lambda: save_weights(model, "cascaded", {"width": 4}, {}))
 
 
-@pytest.mark.parametrize("file", sorted(SHIPPED.rglob("*.safetensors")), ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", [*SHIPPED.glob("*.safetensors"), *SHIPPED.glob("compared/*.safetensors")], ids=lambda file: file.stem
+)
 def test_the_shipped_weights(file: Path) -> None:
     name, about = file.stem, describe_weights(file)
     model = create_model(name, pretrained=True)

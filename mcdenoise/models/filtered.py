@@ -1,0 +1,132 @@
+"""A wrapper that denoises noisy albedo and normal before a method: textures and edges as they would be without noise.
+
+The filters are the large networks for single features that Open Image Denoise 2.5 was published with (Intel
+Corporation, Apache License 2.0). They come with the package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from mcdenoise.errors import check_choice
+from mcdenoise.frame import Frame
+from mcdenoise.models._interface import Model, Needs, Note, Output, State
+from mcdenoise.models._reads import at_hand
+from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn.oidn import FeatureFilter
+from mcdenoise.ops import NO_ALBEDO
+from mcdenoise.sampling import has_centred_features, has_scattered_features
+
+Features: TypeAlias = Literal["auto", "clean", "noisy"]
+FILTERED = ("albedo", "normal")
+_WEIGHTS = Path(__file__).parent / "weights" / "filters"
+
+
+class Filtered(Wrapper):
+    """Denoises albedo and normal for a method, each by itself, if they have noise.
+
+    They have none if they come from one ray through the centre of each pixel that nothing scattered
+    (:func:`mcdenoise.sampling.has_centred_features`, :func:`mcdenoise.sampling.has_scattered_features`). They stay as
+    they are where nothing was hit, and where there is no albedo in 3x3 pixels, such as on emitters.
+
+    Args:
+        inner: any method.
+        features: whether they are ``"noisy"`` or ``"clean"``, or ``"auto"``, to look at each frame. That takes values
+            on the host: on a GPU, and in a graph that is compiled or exported, it counts as clean.
+
+    Raises:
+        InputError: ``features`` is none of these.
+    """
+
+    stage = "filter features"
+    takes = frozenset({*FILTERED, "depth"})
+
+    def __init__(self, inner: Model, features: Features = "auto") -> None:
+        super().__init__(inner)
+        check_choice("features", features, Features)
+        self.features = features
+        self.filters = nn.ModuleDict({name: Tiled(FilterOf(name)) for name in FILTERED})
+        self.train(self.training)
+
+    @property
+    def needs(self) -> Needs:
+        """The needs of the inner model, which sees as much farther as the filters do."""
+        needs, (reach, *_) = super().needs, (each.needs.reach for each in self.filters.values())
+        return replace(needs, reach=None if needs.reach is None else needs.reach + reach)
+
+    def train(self, mode: bool = True) -> Filtered:
+        """The filters are not trained: they see a mirror image around the image, as they always do."""
+        super().train(mode)
+        self.filters.eval()
+        return self
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        reason = self._why_not(frame)
+        output, state = self.inner(frame if reason else self.filtered(frame), state)
+        return output.noted(Note(self.stage, reason, float(reason != ""))), state
+
+    def filtered(self, frame: Frame) -> Frame:
+        """The frame with denoised features."""
+        changes = {}
+        for name, image in ((name, frame.buffer(name)) for name in FILTERED):
+            if image is not None:
+                clean = self.filters[name](Frame(image))[0].image.to(image.dtype)
+                changes[name] = torch.where(_nothing(frame), image, clean)
+        return frame.replace(**changes)
+
+    def _why_not(self, frame: Frame) -> str:
+        if frame.albedo is None and frame.normal is None:
+            return "no features"
+        if self.features != "auto":
+            return "" if self.features == "noisy" else "said to be clean"
+        if not at_hand(frame.color.device):
+            return "not looked for on this device"
+        return "no noise" if has_centred_features(frame) and not has_scattered_features(frame) else ""
+
+
+class FilterOf(nn.Module):
+    """The filter of a single feature as a method: the feature takes the place of the color.
+
+    Its weights are constants of the package: neither trained nor saved.
+
+    Args:
+        name: "albedo" or "normal".
+    """
+
+    stage = "filter features"
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        with torch.device("meta"):
+            self.network = FeatureFilter(name, "large")
+        weights = load_file(_WEIGHTS / f"{name}.safetensors")
+        for key, layer in self.network.unet.named_modules(remove_duplicate=False):
+            for kind in ("weight", "bias") if isinstance(layer, nn.Conv2d) else ():
+                delattr(layer, kind)
+                layer.register_buffer(kind, weights[f"{key}.{kind}"].float(), persistent=False)
+        unet = self.network.unet
+        self.needs = Needs(trainable=False, reach=unet.reach, stride=unet.multiple, live=unet.live)
+
+    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
+        """See :class:`mcdenoise.models.Model`."""
+        return Output(self.network(frame.color)), None
+
+
+def _nothing(frame: Frame) -> Tensor:
+    """``(B, 1, H, W)`` bool: pixels whose features have no noise, whatever is around them."""
+    nothing = torch.zeros_like(frame.color[:, :1], dtype=torch.bool)
+    if frame.depth is not None:
+        nothing = nothing | (frame.depth == torch.inf)
+    if frame.albedo is not None:
+        brightest = frame.albedo.detach().amax(1, keepdim=True)
+        nothing = nothing | (F.max_pool2d(brightest, 3, 1, 1) < NO_ALBEDO)
+    return nothing

@@ -1,0 +1,122 @@
+"""Features are denoised where they have noise, by the published filters, and are otherwise as they were."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from refusals import refused
+from torch import Tensor
+from toys import Same, has_oidn
+
+from mcdenoise import Denoiser, Frame
+from mcdenoise.models import Output, create_model
+from mcdenoise.models.filtered import Filtered, FilterOf
+from mcdenoise.models.oidn import Oidn
+from mcdenoise.train.front import Front, split
+
+SIZE = (48, 64)
+
+
+class Seen(Same):
+    """Keeps the frame that it is handed."""
+
+    def forward(self, frame: Frame, state: object = None) -> tuple[Output, object]:
+        self.frame = frame
+        return super().forward(frame, state)
+
+
+def plane(noise: float) -> Frame:
+    """A leaning plane with a texture, the sky above it, and a lamp on it; with noise in its features."""
+    draws = torch.Generator().manual_seed(0)
+    rows = torch.arange(SIZE[0], dtype=torch.float32).reshape(-1, 1).expand(SIZE)
+    depth = 8 / (1 + 0.05 * rows)[None, None]
+    albedo = torch.full((1, 3, *SIZE), 0.5)
+    albedo[..., ::8] = 0.2
+    normal = torch.tensor([0.0, 0.6, 0.8]).reshape(1, 3, 1, 1).expand(1, 3, *SIZE)
+    albedo = (albedo + noise * torch.randn(albedo.shape, generator=draws)).clamp(0.05, 1)
+    normal = torch.nn.functional.normalize(normal + noise * torch.randn(normal.shape, generator=draws), dim=1)
+    depth[..., :12, :], albedo[..., :12, :] = torch.inf, 0
+    albedo[..., 30:40, 20:30] = 0
+    color = torch.rand(1, 3, *SIZE, generator=draws)
+    return Frame(color, albedo=albedo, normal=normal * (depth < torch.inf), depth=depth)
+
+
+def handed(frame: Frame, **settings: object) -> Frame:
+    seen = Seen()
+    Filtered(seen, **settings).eval()(frame)  # type: ignore[arg-type]
+    return seen.frame
+
+
+@pytest.mark.skipif(not has_oidn(), reason="compares with the library")
+@pytest.mark.parametrize("name", ["albedo", "normal"])
+@torch.no_grad()
+def test_the_filters_are_those_of_the_library(name: str) -> None:
+    image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
+    expected = Oidn(threads=1).filtered({name: image}, "high", clean=False)
+    torch.testing.assert_close(FilterOf(name).eval()(Frame(image))[0].image, expected, rtol=1e-3, atol=1e-3)
+
+
+@torch.no_grad()
+def test_noise_of_features_is_removed_and_what_has_none_stays() -> None:
+    frame, exact = plane(0.2), plane(0.0)
+    found = handed(frame)
+    for name in ("albedo", "normal"):
+        before, after, true = (each.buffer(name) for each in (frame, found, exact))
+        assert isinstance(before, Tensor)
+        assert isinstance(after, Tensor)
+        assert isinstance(true, Tensor)
+        assert (after - true).abs().mean() < 0.4 * (before - true).abs().mean()
+        # The sky, and the lamp but for its rim.
+        assert torch.equal(after[..., :12, :], before[..., :12, :])
+        assert torch.equal(after[..., 31:39, 21:29], before[..., 31:39, 21:29])
+    assert found.color is frame.color
+
+
+@torch.no_grad()
+def test_features_without_noise_are_taken_as_they_are() -> None:
+    frame = plane(0.0)
+    assert handed(frame).albedo is frame.albedo
+    assert handed(plane(0.2), features="clean").normal is not None
+    assert torch.equal(handed(plane(0.2), features="clean").normal, plane(0.2).normal)  # type: ignore[arg-type]
+    assert not torch.equal(handed(frame, features="noisy").albedo, frame.albedo)  # type: ignore[arg-type]
+    assert "features: expected" in refused(lambda: Filtered(Same(), features="loud"))  # type: ignore[arg-type]
+
+
+def test_the_filters_are_constants() -> None:
+    model = create_model("wild_large")
+    assert isinstance(model, Filtered)
+    kept = {*dict(model.named_parameters()), *model.state_dict()}
+    assert kept
+    assert not any("filter" in name for name in kept)
+    model.train()
+    assert not any(each.training for each in model.filters.modules())
+
+
+def test_the_gradient_passes_through_the_filters() -> None:
+    frame = plane(0.2)
+    albedo = frame.albedo.clone().requires_grad_()  # type: ignore[union-attr]
+    seen = Seen()
+    Filtered(seen).eval()(frame.replace(albedo=albedo))
+    (slope,) = torch.autograd.grad(seen.frame.albedo.sum(), albedo)  # type: ignore[union-attr]
+    assert slope.isfinite().all()
+    assert slope.abs().sum() > 0
+
+
+def test_a_network_is_trained_on_filtered_features() -> None:
+    front, rest = split(create_model("wild_large"))
+    assert not any(isinstance(part, Filtered) for part in rest.modules())  # type: ignore[attr-defined]
+    of = front.of({"albedo", "depth"})
+    assert of.parts["albedo"] == 3
+    assert "normal" not in of.parts
+    assert "albedo" not in Front().of({"albedo"}).parts
+    with torch.no_grad():
+        shown = of.begin()(plane(0.2))
+        assert torch.equal(shown.albedo, handed(plane(0.2)).albedo)  # type: ignore[arg-type]
+
+
+@torch.no_grad()
+def test_the_report_says_what_was_filtered() -> None:
+    denoiser = Denoiser("wild_large")
+    for noise, skipped in ((0.2, 0.0), (0.0, 1.0)):
+        denoiser(plane(noise))
+        assert denoiser.report.stages["filter features"].skipped == skipped
