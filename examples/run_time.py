@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from takes import METHODS
+from takes import TIMED
 
 from mcdenoise import Frame, create_model
 from mcdenoise.benchmark.machine import describe_machine
@@ -31,6 +31,7 @@ from mcdenoise.models import Accumulated, Skipping
 from mcdenoise.models._precision import PRECISIONS, Precision, computing_in
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models.filtered import Filtered
 from mcdenoise.turns import interleaved
 
 
@@ -43,8 +44,11 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
     model = create_model(spelling.model, pretrained=pretrained, weights=spelling.weights, **settings)
     if isinstance(model, torch.nn.Module):
         model.to(memory_format=torch.channels_last)
+    filtered = model if isinstance(model, Filtered) and model.features == "noisy" else None
     for accumulated in parts_of(model, Accumulated):
         model = accumulated.inner.inner if isinstance(accumulated.inner, Skipping) else accumulated.inner
+    if filtered is not None:
+        filtered.inner, model = model, filtered
 
     cpu = torch.device("cpu")
 
@@ -59,7 +63,7 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--models", nargs="+", default=[*METHODS], metavar="MODEL")
+    parser.add_argument("--models", nargs="+", default=[*TIMED], metavar="MODEL")
     parser.add_argument("--size", default="1280x720", metavar="WxH")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=7)

@@ -43,6 +43,9 @@ METHODS = {
     "wild": "`wild`",
     "wild_large": "`wild_large`",
 }
+# Those whose run time is measured: it denoises noisy features first, and takes others as they are.
+NOISY = {"wild_large": "wild_large(features=noisy)"}
+TIMED = {**METHODS, NOISY["wild_large"]: "`wild_large`, noisy features"}
 
 
 def errors(denoiser: Denoiser, frames: Sequence[Frame], reference: Tensor) -> dict[str, float]:

@@ -53,14 +53,15 @@ class Filtered(Wrapper):
         super().__init__(inner)
         check_choice("features", features, Features)
         self.features = features
-        self.filters = nn.ModuleDict({name: Tiled(FilterOf(name)) for name in FILTERED})
+        filters = {name: Tiled(FilterOf(name)) for name in FILTERED}
+        self.filters, self._reach = nn.ModuleDict(filters), filters["albedo"].needs.reach or 0
         self.train(self.training)
 
     @property
     def needs(self) -> Needs:
         """The needs of the inner model, which sees as much farther as the filters do."""
-        needs, (reach, *_) = super().needs, (each.needs.reach for each in self.filters.values())
-        return replace(needs, reach=None if needs.reach is None else needs.reach + reach)
+        needs = super().needs
+        return replace(needs, reach=None if needs.reach is None else needs.reach + self._reach)
 
     def train(self, mode: bool = True) -> Filtered:
         """The filters are not trained: they see a mirror image around the image, as they always do."""
