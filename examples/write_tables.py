@@ -84,7 +84,7 @@ def table(figures: Figures) -> str:
         return [f"**{text}**" if value == low else text for text, value, low in zip(texts, errors, least, strict=True)]
 
     rows = [
-        [METHODS[name], *cells(errors), "–".join(f"{time:.0f}" for time in times)]
+        [METHODS[name], *cells(errors), " to ".join(f"{time:.0f}" for time in times)]
         for name, (errors, times) in found.items()
     ]
     return lines(rows, ["", "shots: error", "worst", "flicker", "stills: error", "worst", "ms"])
