@@ -22,8 +22,8 @@ from mcdenoise.data.shards import Shard, find_shards
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
-from mcdenoise.models.wild import _background
-from mcdenoise.train.cache import _code, _digest
+from mcdenoise.models.wild import background_of
+from mcdenoise.train.cache import checksum_of, checksum_of_code
 from mcdenoise.train.data import describe_takes, open_takes
 from mcdenoise.train.footage import shots_of
 from mcdenoise.train.front import Front, split
@@ -59,7 +59,7 @@ def tiles(size: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
 
 def seen(shot: dict[str, Tensor]) -> dict[str, Tensor]:
     """The frames as `wild` sees them where nothing is: without a history. The depth, which tells it, is not packed."""
-    behind = _background(Frame(shot["color"], albedo=shot["albedo"], depth=shot.get("depth")))
+    behind = background_of(Frame(shot["color"], albedo=shot["albedo"], depth=shot.get("depth")))
     if behind is None:
         return shot
     alone = {"color": shot["current"], "recent": shot["current"], "length": torch.ones(())}
@@ -109,7 +109,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for folder in (folder for folder in options.takes if not find_shards(folder)):
         raise InputError(f"{folder}: expected takes, found none")
-    shards, made = open_takes(options.takes), [front.settings, _code(), Path(__file__).read_text("utf-8")]
+    shards, made = open_takes(options.takes), [front.settings, checksum_of_code(), Path(__file__).read_text("utf-8")]
     parts = {
         options.out / f"part-{first // options.size:02}.npz": shards[first : first + options.size]
         for first in range(0, len(shards), options.size)
@@ -117,7 +117,7 @@ def main() -> None:
     for path in sorted(set(options.out.glob("part-*.npz")) - parts.keys()):
         raise InputError(f"{path}: expected no part beside those of these takes, found it; remove it")
     for path, own in parts.items():
-        key = _digest([*made, describe_takes(own)])
+        key = checksum_of([*made, describe_takes(own)])
         if not (path.exists() and key_of(path) == key):
             written(own, front, path, key)
 

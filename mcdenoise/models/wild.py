@@ -162,7 +162,7 @@ class WildNetwork(nn.Module):
             recent = history if frame.recent is None else _lit(frame, frame.recent.to(color.dtype))
             lengths = (frame.length.clamp_max(1 / RECENT_ALPHA), frame.length)
             short, part = ((1 - 1 / length.clamp_min(1)).to(color.dtype) for length in lengths)
-            if (behind := _background(frame)) is not None:
+            if (behind := background_of(frame)) is not None:
                 short, part = (torch.where(behind, 0, each) for each in (short, part))
                 recent, history = (torch.where(behind, alone, image) for image in (recent, history))
             exposed = (image * exposure for image in (alone, recent, history))
@@ -186,7 +186,7 @@ def _lit(frame: Frame, image: Tensor) -> Tensor:
     return image if frame.albedo is None else remodulate(image, frame.albedo)
 
 
-def _background(frame: Frame) -> Tensor | None:
+def background_of(frame: Frame) -> Tensor | None:
     """Where nothing is seen, not even fog, which has an albedo: what is there has no noise, and a history blurs it."""
     if frame.depth is None:
         return None
@@ -210,8 +210,8 @@ def _wild(
         anti_lag: whether the history is shortened where the light has changed, see :func:`mcdenoise.ops.history_lag`.
         tolerance: see :class:`mcdenoise.models.Skipping`.
         features: whether albedo and normal are noisy and to be denoised first, see
-            :class:`mcdenoise.models.filtered.Filtered`; by default "auto" for the large network, and "clean" for the
-            others, whose time it would take several times.
+            :class:`mcdenoise.models.filtered.Filtered`; by default "auto", but "clean" for the small network, because
+            the filters take ten times as long as it does.
 
     Raises:
         InputError: a setting is out of its range.
@@ -221,7 +221,7 @@ def _wild(
     # Clamped fireflies are light that the network would have to guess: stills had a tenth more error.
     made = Demodulated(Accumulated(model, alpha_min=alpha_min, firefly_limit=math.inf, lag_threshold=threshold))
     if features is None:
-        features = "auto" if size == "large" else "clean"
+        features = "clean" if size == "small" else "auto"
     return made if features == "clean" else Filtered(made, features)
 
 

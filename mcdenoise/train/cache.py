@@ -38,8 +38,8 @@ def open_cache(sequence: Sequence, settings: list[Any], folder: Path) -> Keep:
         folder: folder of the whole cache; created if it does not exist.
     """
     settings = [sequence.numbers, *settings]
-    identity = _digest([str(sequence.root.resolve()), *settings])[:16]
-    key = _digest([*settings, _code(), _state(sequence)])
+    identity = checksum_of([str(sequence.root.resolve()), *settings])[:16]
+    key = checksum_of([*settings, checksum_of_code(), _state(sequence)])
     return functools.partial(_kept, folder / f"{sequence.name[:100]}-{identity}", key)
 
 
@@ -80,7 +80,8 @@ def _checksum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _digest(content: Any) -> str:
+def checksum_of(content: Any) -> str:
+    """A checksum of JSON types."""
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
@@ -92,7 +93,7 @@ def _state(sequence: Sequence) -> list[Any]:
 
 
 @functools.cache
-def _code() -> str:
+def checksum_of_code() -> str:
     """Checksum of the whole package, so that a corrected reader or operator does not use arrays of its predecessor.
 
     It covers all files rather than those for decoding and accumulating, because such a list would become outdated.
