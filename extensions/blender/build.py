@@ -18,6 +18,7 @@ from torch import nn
 from mcdenoise.data.files import atomic_path
 from mcdenoise.export import export_model
 from mcdenoise.frame import Frame
+from mcdenoise.methods import parse_method
 from mcdenoise.models import DEFAULT, Needs, Output, State, create_model
 from mcdenoise.models._layers import fractions
 
@@ -46,7 +47,9 @@ def main() -> None:
     """Build the zip that the arguments name."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, required=True, help="the zip to write")
-    parser.add_argument("--model", default=DEFAULT, help="a model with shipped weights, see `mcdenoise models`")
+    # A graph does not look whether features have noise; those of Cycles have.
+    noisy = f"{DEFAULT}(features=noisy)"
+    parser.add_argument("--model", default=noisy, help="a model with shipped weights, see `mcdenoise models`")
     asked = parser.parse_args()
     here = (platform.system(), platform.machine())
     if here not in PLATFORMS:
@@ -56,9 +59,9 @@ def main() -> None:
         folder = Path(name)
         download = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:"]
         subprocess.run([*download, "--python-version", PYTHON, "-d", folder, WHEEL], check=True)
-        export_model(
-            create_model(asked.model, pretrained=True), folder / "model.onnx", buffers=BUFFERS, name=asked.model
-        )
+        method = parse_method(asked.model)
+        model = create_model(method.model, pretrained=True, **method.settings)
+        export_model(model, folder / "model.onnx", buffers=BUFFERS, name=method.name)
         lit = ("color", "albedo", "normal", "depth", "diffuse", "current")
         export_model(Smoother(), folder / "smoother.onnx", buffers=lit)
         (wheel,) = folder.glob("*.whl")
