@@ -22,6 +22,7 @@ from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import BUFFERS, Frame, Hints
 from mcdenoise.models import Model, State
 from mcdenoise.models._contract import check_needs
+from mcdenoise.models.filtered import Filtered
 
 SUFFIXES = (".onnx", ".pt2")
 
@@ -49,7 +50,8 @@ class Step(nn.Module):
 
     def __init__(self, model: Model, buffers: Collection[str]) -> None:
         super().__init__()
-        self.model = model
+        # No graph can look for noise in features.
+        self.model = model.inner if isinstance(model, Filtered) and model.features == "auto" else model
         self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
         self.given += tuple(sorted(set(buffers) - set(self.given)))
         check_needs(model.needs, self.given)
@@ -237,8 +239,8 @@ def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterato
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(exported.path), options, providers=["CPUExecutionProvider"])
     # A graph does not skip anything, so the comparison must not skip either.
-    denoiser = Denoiser(model, precision="float32", keep_all=True)
-    step = Step(denoiser.model, names)
+    step = Step(model, names)
+    denoiser = Denoiser(step.model, precision="float32", keep_all=True)
     state: dict[str, Any] = {}
     for number in sequence.numbers[:_COMPARED]:
         frame = sequence.frame(number, reference=False).to(torch.float32).validate()[0].with_depth()

@@ -9,6 +9,7 @@ from torch import Tensor
 from toys import Same, has_oidn
 
 from mcdenoise import Denoiser, Frame
+from mcdenoise.export import Step, traced
 from mcdenoise.models import Output, create_model
 from mcdenoise.models.filtered import Filtered, FilterOf
 from mcdenoise.models.oidn import Oidn
@@ -80,6 +81,14 @@ def test_features_without_noise_are_taken_as_they_are() -> None:
     assert torch.equal(handed(plane(0.2), features="clean").normal, plane(0.2).normal)  # type: ignore[arg-type]
     assert not torch.equal(handed(frame, features="noisy").albedo, frame.albedo)  # type: ignore[arg-type]
     assert "features: expected" in refused(lambda: Filtered(Same(), features="loud"))  # type: ignore[arg-type]
+
+
+def test_a_graph_takes_features_as_clean() -> None:
+    model = Filtered(lambda color, albedo: color * albedo)  # type: ignore[arg-type]
+    step = Step(model.eval(), {"color", "albedo"})
+    shown = {"color": torch.ones(1, 3, *SIZE), "albedo": torch.rand(1, 3, *SIZE)}
+    assert torch.equal(traced(step).module(check_guards=False)(shown, {})[0], shown["albedo"])
+    assert model.features == "auto"
 
 
 def test_the_filters_are_constants() -> None:
