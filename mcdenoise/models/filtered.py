@@ -7,6 +7,7 @@ Corporation, Apache License 2.0). They come with the package.
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -23,6 +24,7 @@ from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import FeatureFilter
 from mcdenoise.ops import NO_ALBEDO
+from mcdenoise.ops._window import accumulator_dtype
 from mcdenoise.sampling import has_centred_features, has_scattered_features
 
 Features: TypeAlias = Literal["auto", "clean", "noisy"]
@@ -39,7 +41,7 @@ class Filtered(Wrapper):
 
     Args:
         inner: any method.
-        features: whether they are ``"noisy"`` or ``"clean"``, or ``"auto"``, to look at each frame. That takes values
+        features: whether they are ``"noisy"`` or ``"clean"``, or ``"auto"``, to look at each image. That takes values
             on the host: on a GPU, and in a graph that is compiled or exported, it counts as clean.
 
     Raises:
@@ -71,27 +73,33 @@ class Filtered(Wrapper):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        reason = self._why_not(frame)
-        output, state = self.inner(frame if reason else self.filtered(frame), state)
-        return output.noted(Note(self.stage, reason, float(reason != ""))), state
+        kept, reason = self._kept(frame)
+        output, state = self.inner(frame if kept is None else self._filtered(frame, kept), state)
+        return output.noted(Note(self.stage, reason, float(kept is None))), state
 
-    def filtered(self, frame: Frame) -> Frame:
-        """The frame with denoised features."""
+    def _filtered(self, frame: Frame, kept: Tensor) -> Frame:
         changes = {}
         for name, image in ((name, frame.buffer(name)) for name in FILTERED):
             if image is not None:
-                clean = self.filters[name](Frame(image))[0].image.to(image.dtype)
-                changes[name] = torch.where(_nothing(frame), image, clean)
+                clean = self.filters[name](Frame(image.to(accumulator_dtype(image.dtype))))[0].image
+                changes[name] = torch.where(kept, image, clean.to(image.dtype))
         return frame.replace(**changes)
 
-    def _why_not(self, frame: Frame) -> str:
+    def _kept(self, frame: Frame) -> tuple[Tensor | None, str]:
+        """The pixels whose features stay as they are; ``None`` and why, if all do."""
         if frame.albedo is None and frame.normal is None:
-            return "no features"
-        if self.features != "auto":
-            return "" if self.features == "noisy" else "said to be clean"
+            return None, "no features"
+        if self.features == "clean":
+            return None, "said to be clean"
+        if self.features == "noisy":
+            return _nothing(frame), ""
         if not at_hand(frame.color.device):
-            return "not looked for on this device"
-        return "no noise" if has_centred_features(frame) and not has_scattered_features(frame) else ""
+            return None, "not looked for on this device"
+        # Each image of a batch is what it would be alone.
+        each = [frame.map(itemgetter(slice(i, i + 1))) for i in range(len(frame.color))]
+        exact = [has_centred_features(image) and not has_scattered_features(image) for image in each]
+        kept = _nothing(frame) | torch.tensor(exact).reshape(-1, 1, 1, 1)
+        return (None, "no noise") if kept.all() else (kept, "")
 
 
 class FilterOf(nn.Module):

@@ -83,6 +83,23 @@ def test_features_without_noise_are_taken_as_they_are() -> None:
     assert "features: expected" in refused(lambda: Filtered(Same(), features="loud"))  # type: ignore[arg-type]
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_each_image_of_a_batch_is_looked_at(dtype: torch.dtype) -> None:
+    frames = [plane(noise).to(dtype) for noise in (0.2, 0.0)]
+    images = (torch.cat(pair) for pair in zip(*(dict(frame.items()).values() for frame in frames), strict=True))
+    both = handed(Frame(**dict(zip(dict(frames[0].items()), images, strict=True))))  # type: ignore[arg-type]
+    for found, frame in zip(both.albedo.split(1), frames, strict=True):  # type: ignore[union-attr]
+        torch.testing.assert_close(found, handed(frame).albedo)
+    assert torch.equal(both.albedo[1:], frames[1].albedo)  # type: ignore[index, arg-type]
+
+
+@torch.no_grad()
+def test_a_frame_of_the_sky_alone_is_not_filtered() -> None:
+    frame = plane(0.0).crop(slice(0, 12), slice(0, 64))
+    assert handed(frame).albedo is frame.albedo
+
+
 def test_a_graph_takes_features_as_clean() -> None:
     model = Filtered(lambda color, albedo: color * albedo)  # type: ignore[arg-type]
     step = Step(model.eval(), {"color", "albedo"})
