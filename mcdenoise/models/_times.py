@@ -116,4 +116,6 @@ def _is_method(thing: object) -> bool:
 
 def _stage(method: Any, name: str) -> str:
     has_weights = isinstance(method, Oidn) or next(method.parameters(), None) is not None
-    return getattr(method, "stage", "network" if has_weights else name)
+    # A user's network may call a layer so.
+    own = getattr(method, "stage", None)
+    return own if isinstance(own, str) else "network" if has_weights else name

@@ -10,7 +10,7 @@ from toys import Same, has_oidn
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.export import Step, traced
-from mcdenoise.models import Output, create_model
+from mcdenoise.models import Demodulated, Output, create_model
 from mcdenoise.models.filtered import Filtered, FilterOf
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.train.front import Front, split
@@ -146,3 +146,19 @@ def test_the_report_says_what_was_filtered() -> None:
     for noise, skipped in ((0.2, 0.0), (0.0, 1.0)):
         denoiser(plane(noise))
         assert denoiser.report.stages["filter features"].skipped == skipped
+
+
+class Staged(Same):
+    """A network with a layer of this name."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stage = torch.nn.Conv2d(3, 3, 1)
+
+
+@torch.no_grad()
+def test_a_layer_names_no_stage_of_the_report() -> None:
+    denoiser = Denoiser(Demodulated(Staged()))
+    denoiser(plane(0.0))
+    assert "network" in denoiser.report.milliseconds
+    assert all(isinstance(name, str) for name in denoiser.report.milliseconds)
