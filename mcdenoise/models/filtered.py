@@ -86,20 +86,20 @@ class Filtered(Wrapper):
         return frame.replace(**changes)
 
     def _kept(self, frame: Frame) -> tuple[Tensor | None, str]:
-        """The pixels whose features stay as they are; ``None`` and why, if all do."""
+        """The pixels whose features stay as they are, ``None`` for all; and why."""
         if frame.albedo is None and frame.normal is None:
             return None, "no features"
         if self.features == "clean":
             return None, "said to be clean"
         if self.features == "noisy":
-            return _nothing(frame), ""
+            return _nothing(frame), "said to be noisy"
         if not at_hand(frame.color.device):
             return None, "not looked for on this device"
         # Each image of a batch is what it would be alone.
         each = [frame.map(itemgetter(slice(i, i + 1))) for i in range(len(frame.color))]
         exact = [has_centred_features(image) and not has_scattered_features(image) for image in each]
         kept = _nothing(frame) | torch.tensor(exact).reshape(-1, 1, 1, 1)
-        return (None, "no noise") if kept.all() else (kept, "")
+        return (None, "no noise") if kept.all() else (kept, "noise")
 
 
 class FilterOf(nn.Module):
