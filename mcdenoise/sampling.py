@@ -22,7 +22,7 @@ def has_centred_features(frame: Frame) -> bool:
     Averages of several normals are shorter than one, so hardly any pixel may have a short normal. Depth must be smooth:
     along a plane its inverse is linear in the image, and on a curved surface nearly so, but not if rays pass through
     random points of a pixel or a lens. Rays passed through the centres if at least a quarter of the triples of
-    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``.
+    neighbours in a row or a column have ``|a - 2 b + c| < |a - c| / 10``, or if the depth has no slope anywhere.
 
     Args:
         frame: any; without a normal and a depth the answer is no.
@@ -40,7 +40,7 @@ def has_centred_features(frame: Frame) -> bool:
         known = (slope > _LEAST_SLOPE * b) & (torch.minimum(a, c) > 0)
         compared += int(known.sum())
         even += int((known & ((a - 2 * b + c).abs() < _EVEN * slope)).sum())
-    return even > compared / 4
+    return even >= compared / 4
 
 
 def has_scattered_features(frame: Frame) -> bool:

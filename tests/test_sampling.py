@@ -14,6 +14,8 @@ def test_a_plane_seen_through_the_centres() -> None:
     assert has_centred_features(CENTRED)
     # Files in half precision have such a depth.
     assert has_centred_features(CENTRED.replace(depth=CENTRED.depth.half().float()))
+    # A wall that faces the camera shows nothing else.
+    assert has_centred_features(CENTRED.replace(depth=torch.full_like(CENTRED.depth, 3.0)))
 
 
 def test_a_plane_seen_through_random_points_of_the_pixels() -> None:
