@@ -43,9 +43,9 @@ METHODS = {
     "wild": "`wild`",
     "wild_large": "`wild_large`",
 }
-# Those whose run time is measured: it denoises noisy features first, and takes others as they are.
-NOISY = {"wild_large": "wild_large(features=noisy)"}
-TIMED = {**METHODS, NOISY["wild_large"]: "`wild_large`, noisy features"}
+# Those whose run time is measured: these two denoise noisy features first, and take others as they are.
+NOISY = {name: f"{name}(features=noisy)" for name in ("wild", "wild_large")}
+TIMED = {**METHODS, **{spelt: f"`{name}`, noisy features" for name, spelt in NOISY.items()}}
 
 
 def errors(denoiser: Denoiser, frames: Sequence[Frame], reference: Tensor) -> dict[str, float]:

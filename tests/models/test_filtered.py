@@ -48,7 +48,7 @@ def handed(frame: Frame, **settings: object) -> Frame:
     return seen.frame
 
 
-@pytest.mark.skipif(not has_oidn(), reason="compares with the library")
+@has_oidn
 @pytest.mark.parametrize("name", ["albedo", "normal"])
 @torch.no_grad()
 def test_the_filters_are_those_of_the_library(name: str) -> None:

@@ -94,7 +94,7 @@ def test_a_sky_is_taken_from_the_frame_alone(albedo: float, alike: bool) -> None
 
 @has_oidn
 def test_it_starts_as_the_library() -> None:
-    model: Any = create_model("wild")
+    model: Any = create_model("wild", features="clean")
     library = create_model("oidn_open", quality="balanced")
     assert len(start_with(model, "oidn_open", quality="balanced")) == 64
     frame = frame_of(48, 64)
