@@ -7,7 +7,6 @@ Corporation, Apache License 2.0). They come with the package.
 from __future__ import annotations
 
 from dataclasses import replace
-from operator import itemgetter
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -29,6 +28,7 @@ from mcdenoise.sampling import has_centred_features, has_scattered_features
 
 Features: TypeAlias = Literal["auto", "clean", "noisy"]
 FILTERED = ("albedo", "normal")
+_TALL = 512  # height of an image of which some rows tell enough
 _WEIGHTS = Path(__file__).parent / "weights" / "filters"
 
 
@@ -95,10 +95,10 @@ class Filtered(Wrapper):
             return _nothing(frame), "said to be noisy"
         if not at_hand(frame.color.device):
             return None, "not looked for on this device"
-        # Each image of a batch is what it would be alone.
-        each = [frame.map(itemgetter(slice(i, i + 1))) for i in range(len(frame.color))]
-        exact = [has_centred_features(image) and not has_scattered_features(image) for image in each]
-        kept = _nothing(frame) | torch.tensor(exact).reshape(-1, 1, 1, 1)
+        exact = torch.tensor(_are_exact(frame))
+        if exact.all():
+            return None, "no noise"
+        kept = _nothing(frame) | exact.reshape(-1, 1, 1, 1)
         return (None, "no noise") if kept.all() else (kept, "noise")
 
 
@@ -128,6 +128,23 @@ class FilterOf(nn.Module):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         return Output(self.network(frame.color)), None
+
+
+def _are_exact(frame: Frame) -> list[bool]:
+    """For each image of a batch, as it would be alone, whether its features have no noise."""
+    normal, depth = frame.normal, frame.depth
+    if normal is None or depth is None:
+        return [False] * len(frame.color)
+    seen = [Frame(n, normal=n, depth=d) for n, d in zip(_bands(normal), _bands(depth), strict=True)]
+    return [has_centred_features(image) and not has_scattered_features(image) for image in seen]
+
+
+def _bands(image: Tensor) -> list[Tensor]:
+    """For each image of a batch eight of 32 rows, as images of their own: they tell as much in a fourth of the time."""
+    if (height := image.shape[-2]) < _TALL:
+        return list(image.split(1))
+    bands = image[..., : height // 32 * 32, :].unflatten(-2, (-1, 32))[..., :8, :]
+    return list(bands.transpose(1, 2).unbind())
 
 
 def _nothing(frame: Frame) -> Tensor:

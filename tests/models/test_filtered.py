@@ -11,7 +11,7 @@ from toys import Same, has_oidn
 from mcdenoise import Denoiser, Frame
 from mcdenoise.export import Step, traced
 from mcdenoise.models import Demodulated, Output, create_model
-from mcdenoise.models.filtered import Filtered, FilterOf
+from mcdenoise.models.filtered import Filtered, FilterOf, _are_exact
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.train.front import Front, split
 
@@ -26,19 +26,19 @@ class Seen(Same):
         return super().forward(frame, state)
 
 
-def plane(noise: float) -> Frame:
+def plane(noise: float, size: tuple[int, int] = SIZE) -> Frame:
     """A leaning plane with a texture, the sky above it, and a lamp on it; with noise in its features."""
     draws = torch.Generator().manual_seed(0)
-    rows = torch.arange(SIZE[0], dtype=torch.float32).reshape(-1, 1).expand(SIZE)
+    rows = torch.arange(size[0], dtype=torch.float32).reshape(-1, 1).expand(size)
     depth = 8 / (1 + 0.05 * rows)[None, None]
-    albedo = torch.full((1, 3, *SIZE), 0.5)
+    albedo = torch.full((1, 3, *size), 0.5)
     albedo[..., ::8] = 0.2
-    normal = torch.tensor([0.0, 0.6, 0.8]).reshape(1, 3, 1, 1).expand(1, 3, *SIZE)
+    normal = torch.tensor([0.0, 0.6, 0.8]).reshape(1, 3, 1, 1).expand(1, 3, *size)
     albedo = (albedo + noise * torch.randn(albedo.shape, generator=draws)).clamp(0.05, 1)
     normal = torch.nn.functional.normalize(normal + noise * torch.randn(normal.shape, generator=draws), dim=1)
     depth[..., :12, :], albedo[..., :12, :] = torch.inf, 0
     albedo[..., 30:40, 20:30] = 0
-    color = torch.rand(1, 3, *SIZE, generator=draws)
+    color = torch.rand(1, 3, *size, generator=draws)
     return Frame(color, albedo=albedo, normal=normal * (depth < torch.inf), depth=depth)
 
 
@@ -163,3 +163,14 @@ def test_a_layer_names_no_stage_of_the_report() -> None:
     denoiser(plane(0.0))
     assert "network" in denoiser.report.milliseconds
     assert all(isinstance(name, str) for name in denoiser.report.milliseconds)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_some_rows_of_a_tall_image_tell_its_noise(noise: float) -> None:
+    size = (520, 64)
+    tall, clean = plane(noise, size), plane(0.0, size)
+    assert _are_exact(tall) == _are_exact(plane(noise)) == [noise == 0]
+    assert isinstance(tall.normal, Tensor)
+    assert isinstance(clean.normal, Tensor)
+    both = tall.map(lambda image: image.repeat(2, 1, 1, 1)).replace(normal=torch.cat([tall.normal, clean.normal]))
+    assert _are_exact(both) == [noise == 0, True]
