@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
+from mcdenoise.models._defaults import outlined
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._reads import at_hand
 from mcdenoise.models._wrapper import Wrapper
@@ -74,8 +75,10 @@ class Filtered(Wrapper):
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         kept, reason = self._kept(frame)
-        output, state = self.inner(frame if kept is None else self._filtered(frame, kept), state)
-        return output.noted(Note(self.stage, reason, float(kept is None))), state
+        if kept is None:
+            return self.inner(frame, state)
+        output, state = self.inner(self._filtered(frame, kept), state)
+        return output.noted(Note(self.stage, reason)), state
 
     def _filtered(self, frame: Frame, kept: Tensor) -> Frame:
         changes = {}
@@ -86,20 +89,16 @@ class Filtered(Wrapper):
         return frame.replace(**changes)
 
     def _kept(self, frame: Frame) -> tuple[Tensor | None, str]:
-        """The pixels whose features stay as they are, ``None`` for all; and why."""
-        if frame.albedo is None and frame.normal is None:
-            return None, "no features"
-        if self.features == "clean":
-            return None, "said to be clean"
+        """The pixels whose features stay as they are, ``None`` for all; and why others do not."""
+        color = frame.color
+        if self.features == "clean" or (frame.albedo is None and frame.normal is None):
+            return None, ""
         if self.features == "noisy":
             return _nothing(frame), "said to be noisy"
-        if not at_hand(frame.color.device):
-            return None, "not looked for on this device"
-        exact = torch.tensor(_are_exact(frame))
-        if exact.all():
-            return None, "no noise"
-        kept = _nothing(frame) | exact.reshape(-1, 1, 1, 1)
-        return (None, "no noise") if kept.all() else (kept, "noise")
+        if not at_hand(color.device) or all(exact := _are_exact(frame)):
+            return None, ""
+        kept = _nothing(frame) | torch.tensor(exact, device=color.device).reshape(-1, 1, 1, 1)
+        return None if kept.all() else kept, "noise"
 
 
 class FilterOf(nn.Module):
@@ -115,7 +114,7 @@ class FilterOf(nn.Module):
 
     def __init__(self, name: str) -> None:
         super().__init__()
-        with torch.device("meta"):
+        with outlined():
             self.network = FeatureFilter(name, "large")
         weights = load_file(_WEIGHTS / f"{name}.safetensors")
         for key, layer in self.network.unet.named_modules(remove_duplicate=False):
