@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from mcdenoise.errors import InputError
-from mcdenoise.frame import BUFFERS, Frame
+from mcdenoise.frame import Frame
 from mcdenoise.models._entries import Kind
 from mcdenoise.models._interface import Model
 from mcdenoise.models._registry import build_model, find_model, list_models, needs_of_models
@@ -31,8 +31,8 @@ class ModelOverview:
         kind: how the model makes its image.
         paper: authors and year; empty if there is none.
         parameters: number of weights.
-        kmacs_per_pixel: thousands of multiply-adds per pixel in convolutions, which are nearly all of a network's work;
-            ``None`` for a method that is not a network.
+        kmacs_per_pixel: thousands of multiply-adds per pixel in convolutions, which are nearly all of a network's work,
+            for features without noise; ``None`` for a method that is not a network.
         weights: "shipped"; "compared", shipped for comparisons only; "its own", found by the model itself; "to train";
             or "none" for a model without weights.
         needs: names of the required buffers.
@@ -99,9 +99,9 @@ def _kmacs_per_pixel(model: Model) -> float:
     # The import takes 0.2 s.
     from torch.utils.flop_counter import FlopCounterMode
 
-    images: dict[str, Any] = {
-        name: torch.rand(1, BUFFERS[name].channels, _SIDE, _SIDE) for name in ("color", "albedo", "normal", "depth")
-    }
+    images: dict[str, Any] = {name: torch.rand(1, 3, _SIDE, _SIDE) for name in ("color", "albedo")}
+    # A normal and a depth without noise, which no method filters first.
+    images |= {"normal": torch.zeros(1, 3, _SIDE, _SIDE), "depth": torch.ones(1, 1, _SIDE, _SIDE)}
     # The counter knows torch's convolutions but not the fused ones, which run only without derivatives.
     with FlopCounterMode(display=False) as counter, torch.enable_grad():
         model(Frame(**images, motion=torch.zeros(1, 2, _SIDE, _SIDE)))

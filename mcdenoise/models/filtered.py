@@ -58,7 +58,7 @@ class Filtered(Wrapper):
         self.features = features
         filters = {name: Tiled(FilterOf(name)) for name in FILTERED}
         self.filters, self._reach = nn.ModuleDict(filters), filters["albedo"].needs.reach or 0
-        self.train(self.training)
+        self.filters.eval()
 
     @property
     def needs(self) -> Needs:

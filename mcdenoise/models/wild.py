@@ -5,7 +5,8 @@ the library's noisy image they see a mean of the frame and of the accumulated ra
 frames that showed the same surface, or only of the last four. A small network weighs them: a longer history has less
 noise, but is late or blurred where light changes and where pixels move by fractions. Beside it the layers see the
 frame, the accumulated radiance, and how long the history is. Each pixel of the result is a weighted mean of the
-network's own image and of these, so the error falls with every sample.
+network's own image and of these, so the error falls with every sample. Noisy features are denoised before all this, but
+for the small size.
 """
 
 from __future__ import annotations
@@ -226,9 +227,9 @@ def _wild(
 
 
 for _name, _size, _cost in (
-    ("wild", "base", "125 thousand multiplications a pixel"),
+    ("wild", "base", "125 thousand multiplications a pixel, and 610 to denoise noisy features"),
     ("wild_small", "small", "62 thousand"),
-    ("wild_large", "large", "312 thousand"),
+    ("wild_large", "large", "312 thousand, and as many for features as wild"),
 ):
     register_model(
         _name,

@@ -24,7 +24,7 @@ GIVEN: Mapping[str, int] = {OIDN: 3, OIDN_CLEAN: 3, OIDN_ALBEDO: 3, NOISY: 3, CE
 
 @dataclass(frozen=True)
 class Front:
-    """The wrappers without weights at the outside of a model, up to the last one that provides images; may be empty.
+    """The wrappers around a model that are not trained, up to the last one that provides images; may be empty.
 
     Args:
         wrappers: outermost first, each with the settings of its constructor.

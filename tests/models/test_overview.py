@@ -40,6 +40,8 @@ def test_lists_every_model_by_kind_and_name() -> None:
     assert (small.kind, by_name["svgf"].paper) == ("recurrent", "Schied et al. 2017")
     # Multiply-adds are no fewer than a sixteenth of the weights, of which each is used once in 4x4 pixels or more.
     assert small.kmacs_per_pixel > small.parameters / 64 / 1e3
+    # Without the filters of noisy features, which have 610.
+    assert by_name["wild"].kmacs_per_pixel < 2 * small.kmacs_per_pixel
     assert by_name["svgf"].needs == ["color", "depth", "normal"]
     assert by_name["noisy"].weights == "none"
     assert create_model("noisy").needs == Needs(trainable=False, reach=0)
