@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from typing import Any, get_args
 
@@ -43,6 +43,15 @@ def import_optional(package: str, use: str, extra: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise InputError(f"{use} needs {package}, which is not installed; pip install 'mcdenoise[{extra}]'") from error
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Put the place in front of the errors of invalid input inside this block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def check_choice(name: str, value: object, known: Any) -> None:

@@ -5,12 +5,18 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from mcdenoise.errors import InputError
 
 # Far larger than any valid text file of the package.
 LARGEST_TEXT = 64 << 20
 # Some system files report a size of zero but have contents.
 _UNSAID = 1 << 20
+# Characters of a parser's message, which may quote the file.
+_LONGEST = 300
 
 
 def check_file(path: Path) -> None:
@@ -37,11 +43,9 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT) -> bytes:
     with open(os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
         size = os.fstat(file.fileno()).st_size
         # ``read`` allocates the requested size at once, so request no more than the file's size.
-        content = b"" if size > largest else file.read(min(largest, max(size, _UNSAID)) + 1)
-        larger = size > largest or len(content) > largest
-    if larger:
-        raise OSError(errno.EFBIG, f"it is larger than {largest} bytes", str(path))
-    return content
+        if size <= largest and len(content := file.read(min(largest, max(size, _UNSAID)) + 1)) <= largest:
+            return content
+    raise OSError(errno.EFBIG, f"it is larger than {largest} bytes", str(path))
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT, errors: str = "strict") -> str:
@@ -52,3 +56,27 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, errors: str = "strict") -
         UnicodeDecodeError: the file is not valid UTF-8.
     """
     return read_bytes(path, largest).decode("utf-8", errors)
+
+
+@contextmanager
+def expecting(
+    path: Path, what: str, errors: tuple[type[Exception], ...] = (OSError, ValueError, RecursionError)
+) -> Iterator[None]:
+    """Read and parse a file inside this block: whatever is wrong with it is one line.
+
+    Args:
+        path: the file, for the message.
+        what: what it should be.
+        errors: what reading and parsing raise.
+
+    Raises:
+        InputError: raised in the block, or in place of one of ``errors``.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except errors as error:
+        said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        found = " ".join(said.split())[:_LONGEST]
+        raise InputError(f"{path}: expected {what}, found: {found}; check the path and what is there") from error

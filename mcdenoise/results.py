@@ -14,9 +14,8 @@ import numpy as np
 from msgspec import Meta
 
 from mcdenoise.data.files import write_text
-from mcdenoise.errors import InputError
 from mcdenoise.models._precision import Precision
-from mcdenoise.reading import read_text
+from mcdenoise.reading import expecting, read_text
 
 FILE = "results.json"
 OPS_FILE = "ops.json"
@@ -313,19 +312,10 @@ class Results:
             InputError: the file is missing, damaged, or of another version of the format.
         """
         path = folder / FILE
-        expected = f"{path}: expected the results of `mcdenoise benchmark`, found"
-        try:
+        with expecting(path, "the results of `mcdenoise benchmark` in this version of the format"):
             results = msgspec.json.decode(read_text(path), type=cls)
             if fault := next(_faults(results), ""):
                 raise ValueError(fault)
-        except FileNotFoundError as error:
-            raise InputError(f"{expected} no such file") from error
-        except OSError as error:
-            raise InputError(f"{expected} none that can be read ({error.strerror})") from error
-        except RecursionError as error:
-            raise InputError(f"{expected} damage: objects within objects without end") from error
-        except ValueError as error:
-            raise InputError(f"{expected} damage or another version of the format: {error}") from error
         return results
 
 

@@ -26,7 +26,7 @@ TOOLS = REPORTS | {"budget", "demo", "export", "film", "preview", "suite", "trai
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),
-    "reading": set(),
+    "reading": {"errors"},
     # It knows what a signal ends, and what must be tidied up then.
     "interruption": set(),
     "threads": set(),

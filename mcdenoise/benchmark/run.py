@@ -24,7 +24,7 @@ from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.files import make_folder, new_folder
 from mcdenoise.data.images import Metadata
 from mcdenoise.data.sequences import with_unique_names
-from mcdenoise.errors import InputError, MissingBufferError, in_one_line
+from mcdenoise.errors import InputError, MissingBufferError, in_one_line, naming
 from mcdenoise.evaluate import METRICS, USUAL, Scores, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models._report import Stage, summarize
@@ -269,10 +269,8 @@ class _SceneRun:
             start = self._watch.mark()
             frame = self._sequence.frame(number, reference=reference).to(self._settings.device)
             reading = self._watch.between(start, self._watch.mark())
-            try:
+            with naming(f"{self._sequence.root}, frame {number}"):
                 frame, _ = frame.validate()
-            except InputError as error:
-                raise InputError(f"{self._sequence.root}, frame {number}: {error}") from error
             yield number, frame, reading
 
     def _at_work(self) -> Iterator[tuple[Method, Timed]]:

@@ -16,11 +16,10 @@ from rich.console import Console
 from mcdenoise.cli import load_command, parse
 from mcdenoise.cli._options import Out
 from mcdenoise.cli._output import say, warn
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, naming
 from mcdenoise.heap import keep_heap
 from mcdenoise.train import Progress, Recipe, Rendering, Run, RunFolder, TrainConfig, is_first_process
 from mcdenoise.train import train as run
-from mcdenoise.train.recipe import naming
 
 
 def train(

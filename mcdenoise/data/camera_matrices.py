@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
-from mcdenoise.reading import read_text
+from mcdenoise.reading import expecting, read_text
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -76,11 +76,8 @@ def read_camera_matrices(path: Path) -> CameraMatrices:
     Raises:
         InputError: the file is missing, too large, incomplete, or contains something other than finite numbers.
     """
-    try:
-        text = read_text(path, _LARGEST_FILE, errors="replace")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    text = _COMMENT.sub(" ", text)
+    with expecting(path, "a C header"):
+        text = _COMMENT.sub(" ", read_text(path, _LARGEST_FILE, errors="replace"))
     matrices = _read_variable(path, text, "camera_matrices", (-1, 4, 4))
     return CameraMatrices(matrices, _read_variable(path, text, "pixel_offsets", (len(matrices), 2)))
 
@@ -131,25 +128,22 @@ def write_camera_matrices(path: Path, cameras: CameraMatrices, comment: str = ""
 
 
 def _read_variable(path: Path, text: str, name: str, shape: tuple[int, ...]) -> Array:
-    expected = "numbers " + "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape)
+    sides = "".join(f"[{n}]" if n >= 0 else "[N]" for n in shape)
     word = re.compile(rf"\b{name}\b")
     # A statement ends with a semicolon. Each statement is examined once, however often it contains the name.
     statements = (statement.partition("=") for statement in text.split(";")[:-1])
     initialiser = next((value for head, equals, value in statements if equals and word.search(head)), None)
-    if initialiser is None:
-        raise _malformed(path, name, expected, "it incomplete" if word.search(text) else "no such variable")
-    if not _INITIALISER.fullmatch(initialiser):
-        raise _malformed(path, name, expected, "something else")
-    values = np.array([float(each) for each in _NUMBER.findall(initialiser)])
-    # As in C, inner braces may be left out.
-    try:
-        values = values.reshape(shape)
-    except ValueError as error:
-        raise _malformed(path, name, expected, f"{values.size} numbers") from error
-    # The header declares single precision, and frames store it.
-    if not (np.abs(values) <= np.finfo(np.float32).max).all():
-        raise _malformed(path, name, expected, "a number too large for single precision")
-    return values
+    with expecting(path, f"'{name}', numbers {sides}"):
+        if initialiser is None:
+            raise ValueError("it is incomplete" if word.search(text) else "no such variable")
+        if not _INITIALISER.fullmatch(initialiser):
+            raise ValueError("something else")
+        # As in C, inner braces may be left out.
+        values = np.array([float(each) for each in _NUMBER.findall(initialiser)]).reshape(shape)
+        # The header declares single precision, and frames store it.
+        if not (np.abs(values) <= np.finfo(np.float32).max).all():
+            raise ValueError("a number too large for single precision")
+        return values
 
 
 def _literal(value: float | list[Any]) -> str:
@@ -158,7 +152,3 @@ def _literal(value: float | list[Any]) -> str:
         return "{" + separator.join(_literal(item) for item in value) + "}"
     text = f"{value:.9g}"
     return f"{text}f" if any(mark in text for mark in ".e") else f"{text}.0f"
-
-
-def _malformed(path: Path, name: str, expected: str, found: str) -> InputError:
-    return InputError(f"{path}: expected '{name}' to be {expected}, found {found}; write the file again")

@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mcdenoise.errors import InputError
-from mcdenoise.reading import read_text
+from mcdenoise.errors import InputError, naming
+from mcdenoise.reading import expecting, read_text
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -120,10 +120,8 @@ def load_camera_path(path: Path) -> CameraPath:
             raise InputError(f"{path}: camera of frame {number} is unusable: {missing}") from error
     if not cameras:
         raise InputError(f"{path}: expected at least one camera, found none")
-    try:
+    with naming(str(path)):
         return CameraPath(cameras, check_moves(content.get("objects", {}), len(cameras)))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def check_moves(moves: Mapping[str, Any], frames: int) -> dict[str, Array]:
@@ -221,16 +219,8 @@ def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:
 
 
 def _read_json(path: Path) -> Any:
-    try:
+    with expecting(path, "a camera path in JSON"):
         return json.loads(_LAST_COMMA.sub(lambda match: match[1] or "", read_text(path)))
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected a camera path, found nothing readable ({error.strerror}); check the path"
-        ) from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: expected JSON, found something else ({error}); check that it is a camera path"
-        ) from error
 
 
 def _last_number(path: Path) -> tuple[int, str]:

@@ -15,6 +15,7 @@ from typing import Any
 
 from mcdenoise.errors import InputError
 from mcdenoise.interruption import delete, unfinished
+from mcdenoise.reading import expecting
 
 try:
     import fcntl
@@ -199,10 +200,8 @@ def make_folder(path: Path) -> None:
     Raises:
         InputError: that is impossible.
     """
-    try:
+    with expecting(path, "a folder that can be written to"):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: expected a folder that can be written to, found: {error.strerror}") from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -320,10 +319,8 @@ def listed(folder: Path) -> list[Path]:
     Raises:
         InputError: it cannot be listed.
     """
-    try:
+    with expecting(folder, "a folder that can be read"):
         return [folder / name for name in sorted(os.listdir(folder))]
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def cannot_write(path: Path, reason: str) -> InputError:

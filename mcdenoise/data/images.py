@@ -21,7 +21,7 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from mcdenoise.errors import InputError, is_unicode
-from mcdenoise.reading import check_file
+from mcdenoise.reading import check_file, expecting
 
 Image: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -245,10 +245,8 @@ def _read(
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[oiio.ImageInput, ImageHeader]]:
-    try:
+    with expecting(path, "an image"):
         check_file(path)
-    except OSError as error:
-        raise InputError(f"{path}: expected an image, found: {error.strerror}; check the path") from error
     check_name(path)
     if path.suffix.lower() not in FORMATS:
         raise InputError(f"{path}: expected one of {', '.join(FORMATS)}, found '{path.suffix}'; convert the file")
@@ -288,10 +286,8 @@ def _png_is_whole(path: Path) -> bool:
 
     The library prints its errors about damaged chunks to the terminal, and does not notice missing chunks at the end.
     """
-    try:
+    with expecting(path, "an image"):
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error}); check its permissions") from error
     place = len(_PNG)
     while content.startswith(_PNG) and place + 12 <= len(content):
         length, kind = struct.unpack_from(">I4s", content, place)

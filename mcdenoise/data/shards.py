@@ -22,16 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcdenoise.data.files import atomic_path
-from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS
-from mcdenoise.reading import check_file
+from mcdenoise.reading import check_file, expecting
 
 SUFFIX = ".take.npz"
 ERROR = "reference_error"
 _FORMAT = 1
 _LARGEST_HEADER = 1 << 20
-# Characters of a message about damage.
-_LONGEST = 160
 
 Halves = NDArray[np.float16]
 
@@ -156,12 +153,8 @@ def _joined(files: zipfile.ZipFile, name: str, shape: tuple[int, ...]) -> Halves
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     """The zip; whatever goes wrong with it is one line."""
-    try:
+    # zipfile, zlib and numpy raise a dozen different exceptions for damaged data, some with all of the data.
+    with expecting(path, "a packed take", (Exception,)):
         check_file(path)
         with zipfile.ZipFile(path) as files:
             yield files
-    # zipfile, zlib and numpy raise a dozen different exceptions for damaged data, some with all of the data.
-    except Exception as error:
-        found = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        found = " ".join(found.split())[:_LONGEST]
-        raise InputError(f"{path}: expected a packed take, found {found}; render it again") from error

@@ -17,7 +17,7 @@ import msgspec
 
 from mcdenoise.data.files import held, make_folder, sweep, write_json, write_text
 from mcdenoise.engines import Engine, RayEngine, Task, run_tasks
-from mcdenoise.errors import InputError
+from mcdenoise.errors import naming
 from mcdenoise.film import work
 from mcdenoise.film.manifest import RECORDS, Shot
 from mcdenoise.report import render_page
@@ -160,12 +160,10 @@ def _check(shots: Iterable[Shot], device: str) -> None:
     # To measure which precision is fast takes time.
     changes: dict[str, Any] = {"frames": None, "precision": "float32"} | ({"device": device} if device else {})
     for settings, shot in {replace(each.settings, **changes): each for each in shots}.items():
-        try:
+        with naming(f"shot '{shot.name}'"):
             settings.denoiser()
             if settings.results is not None:
                 Results.read(settings.results)
-        except InputError as error:
-            raise InputError(f"shot '{shot.name}': {error}") from error
 
 
 def _count(result: ShotResult, out: Path) -> int:

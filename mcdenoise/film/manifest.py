@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 
 from mcdenoise.data.sequences import parse_frames
-from mcdenoise.errors import InputError, did_you_mean, is_unicode, printable
+from mcdenoise.errors import InputError, did_you_mean, is_unicode
 from mcdenoise.methods import WEIGHTS, check_names_no_code
-from mcdenoise.reading import read_text
+from mcdenoise.reading import expecting, read_text
 from mcdenoise.shot import ShotSettings
 
 # Folders of the thumbnails and of the records, beside the shots.
@@ -89,19 +89,12 @@ class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _of_file(path: Path, settings: ShotSettings) -> list[Shot]:
-    try:
+    tables = "tables [[shot]] of name and input, or shots = 'a pattern of folders', and perhaps [every]"
+    with expecting(path, f"the manifest of a film, TOML with {tables}"):
         manifest = msgspec.convert(tomllib.loads(read_text(path)), _Manifest)
         if bool(manifest.shot) is bool(manifest.shots):
             misplaced = "shots" in manifest.every
             raise ValueError("'shots' in [every]; write it above" if misplaced else "both or none of them")
-    except OSError as error:
-        raise InputError(f"{path}: expected a manifest of a film, found: {error.strerror}; check the path") from error
-    # An integer of too many digits is a ValueError, as are all others.
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path}: expected TOML with tables [[shot]] of name and input, or shots = 'a pattern of folders', and "
-            f"perhaps [every], found: {printable(str(error))[:300]}; mend it there"
-        ) from error
     settings = _settings(manifest.every, settings, f"{path}, [every]", path.parent)
     if manifest.shots:
         return _of_pattern(path.parent / manifest.shots, settings)
@@ -126,7 +119,7 @@ def _shot(name: str, inputs: tuple[Path, ...], settings: ShotSettings, where: st
     if not plain or name.casefold() in _TAKEN or len(os.fsencode(name)) > _LONGEST_NAME:
         raise InputError(
             f"{where}: expected a name that a folder can have, in UTF-8, without slashes or a dot before it, not "
-            f"one of {', '.join(sorted(_TAKEN))}, found {printable(repr(name[:80]))}; choose another"
+            f"one of {', '.join(sorted(_TAKEN))}, found {name[:80]!r}; choose another"
         )
     return Shot(name, tuple(Path(os.path.abspath(path)) for path in inputs), settings)
 
@@ -150,7 +143,7 @@ def _settings(table: Mapping[str, Any], settings: ShotSettings, where: str, base
         if made.frames is not None:
             parse_frames(made.frames)
     except ValueError as error:
-        raise InputError(f"{where}: {printable(str(error))[:300]}; see `mcdenoise denoise --help`") from error
+        raise InputError(f"{where}: {str(error)[:300]}; see `mcdenoise denoise --help`") from error
     if made.model is not None and "model" in table:
         check_names_no_code(made.model, f"{where}, model")
     return _absolute(made, base)

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from mcdenoise.errors import InputError, first_line
+from mcdenoise.errors import InputError, first_line, naming
 from mcdenoise.models._defaults import without_draws
 from mcdenoise.models._entries import Entry
 from mcdenoise.models._interface import Model
@@ -255,10 +255,8 @@ def start_with(model: Model, name: str, **settings: Any) -> str:
         InputError: there are no weights of this name, a layer of theirs is missing or smaller, or a package that the
             other model needs is missing.
     """
-    try:
+    with naming("start_from"):
         other = create_model(name, pretrained=True, **settings)
-    except InputError as error:
-        raise InputError(f"start_from: {error}") from error
     own = _named(model)
     tensors = _named(other)
     if not tensors:

@@ -15,7 +15,7 @@ import torch
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.shards import ERROR, Shard
-from mcdenoise.errors import InputError, level_of_caller
+from mcdenoise.errors import InputError, level_of_caller, naming
 from mcdenoise.frame import Frame
 from mcdenoise.light import replace_invalid
 from mcdenoise.models._history import motion_to_previous
@@ -239,11 +239,9 @@ def _decoded(sequence: Sequence, wanted: frozenset[str], noise_seeds: int, *, ke
             for image in radiance.values():
                 digest.update(image.numpy().tobytes())
             # ``validate`` replaces invalid pixels only in the color; a reference comes from the same renderer.
-            try:
+            with naming(f"{sequence.root}, frame {number}"):
                 mended = {name: replace_invalid(image)[0] for name, image in radiance.items()}
                 frame = frame.replace(**mended).validate()[0].with_depth()
-            except InputError as error:
-                raise InputError(f"{sequence.root}, frame {number}: {error}") from error
             if computed:
                 motion = motion_to_previous(frame, camera)
                 unknown = torch.full_like(frame.color[:, :2], torch.inf)

@@ -19,8 +19,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import GenericAlias
@@ -32,7 +31,7 @@ from msgspec import UNSET, Meta
 from mcdenoise.data.files import held, write_text, writing
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.data.shards import find_shards
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, naming
 from mcdenoise.methods import check_names_no_code
 from mcdenoise.models import create_model
 from mcdenoise.reading import read_text
@@ -224,15 +223,6 @@ def _run_tables(path: Path, content: dict[str, Any]) -> list[tuple[str, dict[str
                 raise InputError(f"{where}: name: expected each name once, found '{each['name']}' again")
             found[each["name"]] = where, each
     return list(found.values())
-
-
-@contextmanager
-def naming(where: str) -> Iterator[None]:
-    """Add the location in the recipe to errors."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from error
 
 
 def _parsed(path: Path, options: Collection[str]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def moving(objects: object) -> str:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "expected JSON"),
+        ("{", "in JSON, found"),
         ("[]", "expected a list 'to_world'"),
         ('{"fov": 70, "to_world": []}', "at least one camera"),
         ('{"to_world": [[]]}', "unusable: nothing under 'fov'"),

@@ -182,7 +182,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "camera.json no object": (lambda inputs: (inputs / "camera.json").write_text("[1]"), "expected a JSON object"),
     "camera.json unclear": (
         lambda inputs: (inputs / "camera.json").write_text('{"color_includes_albedo": "yes"}'),
-        "to be true or false, found 'yes'",
+        "is true or false, found: 'yes'",
     ),
     "albedo to multiply is missing": (_without_albedo, "expected albedo files"),
 }

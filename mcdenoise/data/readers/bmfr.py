@@ -12,6 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,7 +30,7 @@ from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.reading import read_text
+from mcdenoise.reading import expecting, read_text
 
 # File names of the buffers in writing order: color is last, so that a frame that has its color is complete.
 _STEMS = {
@@ -347,13 +348,11 @@ def _color_has_albedo(path: Path, albedo_present: bool) -> bool | None:
     if not os.path.lexists(description):
         # Without albedo there is nothing to multiply by: this is ordinary radiance, not the published data.
         return None if albedo_present else True
-    try:
-        content = json.loads(read_text(description))
+    with expecting(description, "a JSON object, in which 'color_includes_albedo' is true or false"):
+        content = msgspec.convert(json.loads(read_text(description)), dict[str, Any])
         has_albedo = content.get("color_includes_albedo", True)
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
-        raise InputError(f"{description}: expected a JSON object, found something else; repair or remove it") from error
-    if not isinstance(has_albedo, bool):
-        raise InputError(f"{description}: expected 'color_includes_albedo' to be true or false, found {has_albedo!r}")
+        if not isinstance(has_albedo, bool):
+            raise ValueError(repr(has_albedo))
     if not has_albedo and not albedo_present:
         raise InputError(
             f"{path}: expected albedo files, because camera.json says that color has no albedo in it, found none; "

@@ -29,9 +29,10 @@ from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.sequence import Denoised
 from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
-from mcdenoise.errors import InputError, first_line, import_optional
+from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import Frame
 from mcdenoise.motion import miss
+from mcdenoise.reading import expecting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -100,17 +101,17 @@ class _Arrays:
         name, _, chunk = key.partition("/")
         described = chunk.startswith(".z")
         if info.file_size > (_SMALL if described else _LARGEST_RATIO * info.compress_size + _SMALL):
-            raise _damaged(self.file, f"'{key}' of {info.file_size} bytes")
+            raise ValueError(f"'{key}' of {info.file_size} bytes")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             # These are decompressed whole, whatever size is stated.
-            raise _damaged(self.file, f"'{key}' compressed by another method than deflate")
+            raise ValueError(f"'{key}' compressed by another method than deflate")
         with self.file.open(info) as stream:
             # With a size, no more than that is decompressed.
             content = stream.read(info.file_size)
         # Blosc allocates what a chunk says that it holds.
         promised = -1 if len(content) < _BLOSC_HEADER else int.from_bytes(content[4:8], "little")
         if len(content) != info.file_size or (not described and promised != self._promised.get(name, promised)):
-            raise _damaged(self.file, f"'{key}' of another size than is stated")
+            raise ValueError(f"'{key}' of another size than is stated")
         return content
 
     def whole(self, name: str) -> Array:
@@ -121,7 +122,7 @@ class _Arrays:
         """A small array; its numbers must be finite."""
         values = self.whole(name)
         if not np.isfinite(values).all():
-            raise _damaged(self.file, f"numbers in '{name}' that are not finite")
+            raise ValueError(f"numbers in '{name}' that are not finite")
         return values
 
     def pieces(self, name: str) -> Iterator[tuple[slice, slice, Any]]:
@@ -359,19 +360,19 @@ def _shapes(path: Path) -> dict[str, tuple[int, ...]]:
         file = arrays.file
         names = sorted(name.removesuffix("/.zarray") for name in file.namelist() if name.endswith("/.zarray"))
         if not {"color", "exposure"} <= set(names):
-            raise _damaged(file, f"arrays {', '.join(names[:8]) or 'of no kind'} without 'color' and 'exposure'")
+            raise ValueError(f"arrays {', '.join(names[:8]) or 'of no kind'} without 'color' and 'exposure'")
         found = {name: arrays.array(name) for name in names if name in _ARRAYS}
         color = found["color"].shape
         lead = color[:-4]
         height, width, samples = color[-3:] if len(color) >= 4 else (0, 0, 0)
         sides = {"H": height, "W": width, "S": samples}
         if len(lead) > 1 or not (0 < height * width <= LARGEST_PIXEL_COUNT and 0 < samples <= _LARGEST_SAMPLES):
-            raise _damaged(file, f"'color' of shape {color}")
+            raise ValueError(f"'color' of shape {color}")
         for name, array in found.items():
             letters, kind = _ARRAYS[name]
             shape = (*lead, *(sides.get(letter) or int(letter) for letter in letters))
             if array.shape != shape or array.dtype != np.dtype(kind):
-                raise _damaged(file, f"'{name}' of {array.dtype} {array.shape} beside 'color' {color}")
+                raise ValueError(f"'{name}' of {array.dtype} {array.shape} beside 'color' {color}")
             _check_chunks(file, name, array)
         return {name: found[name].shape if name in found else () for name in names}
 
@@ -381,13 +382,13 @@ def _check_chunks(file: zipfile.ZipFile, name: str, array: ZarrArray[Any]) -> No
     from numcodecs import Blosc
 
     if array.filters or not all(isinstance(codec, Blosc) for codec in array.compressors) or array.order != "C":
-        raise _damaged(file, f"'{name}' with other codecs than Blosc, or in another order")
+        raise ValueError(f"'{name}' with other codecs than Blosc, or in another order")
     sizes = [entry.file_size for entry in file.infolist() if entry.filename.startswith(f"{name}/")]
     # Zarr would read a missing chunk as zeros, that is, as black.
     if array.nchunks > len(sizes) or array.nchunks_initialized != array.nchunks:
-        raise _damaged(file, f"'{name}' without all of its chunks")
+        raise ValueError(f"'{name}' without all of its chunks")
     if math.prod(array.chunks) * array.dtype.itemsize > _LARGEST_RATIO * max(sizes) + _SMALL:
-        raise _damaged(file, f"chunks of '{name}' of shape {array.chunks}")
+        raise ValueError(f"chunks of '{name}' of shape {array.chunks}")
 
 
 @contextmanager
@@ -396,21 +397,9 @@ def _opened(path: Path, index: int | None = None) -> Iterator[_Arrays]:
     if not os.path.isfile(path):
         raise InputError(f"{path}: expected a zip of Noisebase, found none; check the path")
     import_optional("zarr", "noisebase", "noisebase")
-    try:
-        with zipfile.ZipFile(path) as file:
-            yield _Arrays(file, index)
-    except InputError:
-        raise
-    except MemoryError as error:
-        raise InputError(f"{path}: expected a zip of Noisebase, found no memory for a frame of it") from error
     # zipfile, zarr and numcodecs raise a dozen different exceptions for damaged data.
-    except Exception as error:
-        reason = first_line(error)[:200]
-        raise InputError(f"{path}: expected a zip of Noisebase, found it damaged ({reason}); copy it again") from error
-
-
-def _damaged(file: zipfile.ZipFile, found: str) -> InputError:
-    return InputError(f"{file.filename}: expected a zip of Noisebase, found {found[:300]}; copy it again")
+    with expecting(path, "a zip of Noisebase", (Exception,)), zipfile.ZipFile(path) as file:
+        yield _Arrays(file, index)
 
 
 def _tensor(image: Array) -> Tensor:
