@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -18,7 +18,6 @@ from mcdenoise.models._precision import Precision
 from mcdenoise.reading import expecting, read_text
 
 FILE = "results.json"
-OPS_FILE = "ops.json"
 IMAGES = "images"
 VERSION: Literal[2] = 2
 STAGES = ("read", "accumulate", "network", "filter", "write")
@@ -234,7 +233,23 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Results:
+class _Stored:
+    """A run whose results are a file in its folder."""
+
+    file: ClassVar[str]
+
+    def write(self, folder: Path) -> None:
+        """Write the file of this kind of results, ``results.json`` or ``ops.json``.
+
+        Raises:
+            InputError: the file cannot be written.
+            ValueError: a number is NaN or infinite, which JSON does not allow.
+        """
+        write_text(folder / self.file, json.dumps(asdict(self), indent=1, allow_nan=False) + "\n")
+
+
+@dataclass(frozen=True)
+class Results(_Stored):
     """The results of one run of the benchmark.
 
     Args:
@@ -262,6 +277,7 @@ class Results:
     fits: list[Fit] = field(default_factory=list)
     version: Literal[2] = VERSION
     notes: list[str] = field(default_factory=list)
+    file = FILE
 
     @property
     def failed(self) -> bool:
@@ -294,15 +310,6 @@ class Results:
         """Megapixels per second that a method denoises, without reading and writing files."""
         scene = next(one for one in self.scenes if one.name == cell.scene)
         return scene.width * scene.height / 1e3 / cell.computing.median if cell.computing else None
-
-    def write(self, folder: Path) -> None:
-        """Write ``results.json``.
-
-        Raises:
-            InputError: the file cannot be written.
-            ValueError: a number is NaN or infinite, which JSON does not allow.
-        """
-        _write(folder / FILE, self)
 
     @classmethod
     def read(cls, folder: Path) -> Results:
@@ -367,7 +374,7 @@ class OpCost:
 
 
 @dataclass(frozen=True)
-class OpResults:
+class OpResults(_Stored):
     """The results of ``mcdenoise benchmark --ops``.
 
     Args:
@@ -391,19 +398,7 @@ class OpResults:
     bandwidth: float
     costs: list[OpCost]
     version: int = VERSION
-
-    def write(self, folder: Path) -> None:
-        """Write ``ops.json``.
-
-        Raises:
-            InputError: the file cannot be written.
-            ValueError: a number is NaN or infinite, which JSON does not allow.
-        """
-        _write(folder / OPS_FILE, self)
-
-
-def _write(path: Path, results: Results | OpResults) -> None:
-    write_text(path, json.dumps(asdict(results), indent=1, allow_nan=False) + "\n")
+    file = "ops.json"
 
 
 def _faults(results: Results) -> Iterator[str]:
