@@ -14,7 +14,7 @@ from refusals import full_disk
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
-from mcdenoise.data.readers.bmfr import write_buffer
+from mcdenoise.data.readers.bmfr import write_buffers
 from mcdenoise.data.shards import Shard, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
@@ -38,7 +38,7 @@ def noisy(small_sequence: Path) -> Path:
         folder.mkdir()
         for number in range(4):
             torch.manual_seed(10 * noise_seed + number)
-            write_buffer(folder, number, "color", torch.rand(1, 3, 20, 24))
+            write_buffers(folder, number, {"color": torch.rand(1, 3, 20, 24)})
     return small_sequence
 
 
@@ -50,8 +50,8 @@ def noisy_features(noisy: Path) -> Path:
         for number, position in enumerate(positions):
             torch.manual_seed(100 * noise_seed + number)
             folder = inputs / f"noise_seed{noise_seed}"
-            write_buffer(folder, number, "albedo", 0.2 + 0.7 * torch.rand(1, 3, 20, 24))
-            write_buffer(folder, number, "position", position + 0.01 * torch.rand(1, 3, 20, 24))
+            write_buffers(folder, number, {"albedo": 0.2 + 0.7 * torch.rand(1, 3, 20, 24)})
+            write_buffers(folder, number, {"position": position + 0.01 * torch.rand(1, 3, 20, 24)})
     return noisy
 
 
@@ -127,7 +127,7 @@ def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:
     assert clip["motion"][1].abs().median() > 0.1
     inputs = noisy / "inputs"
     for number in sequence.numbers:
-        write_buffer(inputs, number, "motion", torch.full((1, 2, 20, 24), 1.5))
+        write_buffers(inputs, number, {"motion": torch.full((1, 2, 20, 24), 1.5)})
     # The sequence's own comes first.
     own = opened(noisy, tmp_path / "cache", features=["motion"])[1].read()
     assert (own["motion"] == 1.5).all()

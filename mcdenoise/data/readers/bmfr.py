@@ -275,20 +275,15 @@ def write_buffers(folder: Path, number: int, buffers: Mapping[str, Tensor]) -> N
     """
     make_folder(folder)
     for name, buffer in buffers.items():
-        write_buffer(folder, number, name, buffer)
-
-
-def write_buffer(folder: Path, number: int, name: str, buffer: Tensor) -> None:
-    """Write one buffer of a frame to a folder that exists, see :func:`write_buffers`."""
-    if name == "samples":
-        write_samples(folder / f"{_STEMS[name]}{number}.exr", buffer[0].detach().float().cpu().numpy())
-        return
-    image = buffer[0].detach().float().permute(1, 2, 0).cpu().numpy()
-    if name == "depth":
-        image = np.where(np.isinf(image), 0, image)
-    full_float = name in _FULL_FLOAT or (name == "depth" and bool(image.max() > LARGEST_HALF))
-    path = folder / f"{_STEMS[name]}{number}.exr"
-    write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float)
+        path, image = folder / f"{_STEMS[name]}{number}.exr", buffer[0].detach().float().cpu().numpy()
+        if name == "samples":
+            write_samples(path, image)
+            continue
+        image = image.transpose(1, 2, 0)
+        if name == "depth":
+            image = np.where(np.isinf(image), 0, image)
+        full_float = name in _FULL_FLOAT or (name == "depth" and bool(image.max() > LARGEST_HALF))
+        write_exr(path, image, _CHANNELS[image.shape[2]], full_float=full_float)
 
 
 def has_buffers(folder: Path, number: int, names: Iterable[str], size: tuple[int, int]) -> bool:
