@@ -16,6 +16,7 @@ from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.data import Sequence
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
+from mcdenoise.folder import denoised_frames
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models._precision import PRECISIONS, Precision
 from mcdenoise.models._weights import pretrained_models
@@ -71,8 +72,8 @@ def choose_model(
 
     Args:
         sequence: the sequence to denoise.
-        budget: milliseconds per frame, without reading and writing files.
-        max_error: SMAPE of scene-linear radiance.
+        budget: milliseconds per frame, without reading and writing files; above 0.
+        max_error: SMAPE of scene-linear radiance; above 0.
         results: folder of a finished benchmark, whose errors (mean over its scenes) are used; without it errors are
             measured on the last frames of the sequence that have a reference.
         device: device to run on.
@@ -81,9 +82,6 @@ def choose_model(
     Raises:
         InputError: no model meets the limits, or ``max_error`` is given and no errors are known.
     """
-    for name, value in (("--budget-ms", budget), ("--max-error", max_error)):
-        if value is not None and not value > 0:
-            raise InputError(f"{name}: expected more than 0, found {value:g}")
     if results is None and max_error is not None and not sequence.reference_numbers:
         raise InputError(
             f"--max-error: expected references in {sequence.root}, or --results of a finished benchmark, found neither"
@@ -151,10 +149,6 @@ def _error(choice: Choice, sequence: Sequence, device: str) -> float:
     scored = sequence.reference_numbers[-_SCORED:]
     numbers = [number for number in sequence.numbers if scored[0] - _HISTORY <= number <= scored[-1]]
     denoiser = Denoiser(choice.model, precision=choice.precision, device=device)
-    errors = []
-    for number in numbers:
-        frame = sequence.frame(number).to(device)
-        image = denoiser(frame)
-        if number in scored and frame.reference is not None:
-            errors.append(float(smape_linear(image, frame.reference)))
-    return statistics.mean(errors)
+    frames = denoised_frames(sequence.part(numbers), denoiser)
+    pairs = [(output.image.cpu(), frame.reference) for number, frame, output in frames if number in scored]
+    return statistics.mean(float(smape_linear(image, truth)) for image, truth in pairs if truth is not None)

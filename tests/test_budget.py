@@ -13,6 +13,7 @@ from mcdenoise.budget import Choice, choose_model
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.models._weights import pretrained_models
 from mcdenoise.results import Cell, Machine, Method, Results, Scene
+from mcdenoise.shot import ShotSettings
 
 TIMES = {"wild_large": 300.0, "wild": 170.0, "wild_small": 80.0}
 
@@ -78,7 +79,7 @@ def test_limits_that_no_model_meets_are_told_in_one_line(sequence: Sequence, res
     message = refused(lambda: choose_model(sequence, budget=100, max_error=0.01, results=results))
     assert "at most 0.01 in 100 ms, found at best wild_small: 80.0 ms a frame, SMAPE 0.08" in message
     assert "oidn_temporal" in message
-    assert "--max-error: expected more than 0" in refused(lambda: choose_model(sequence, max_error=-1))
+    assert "--max-error: expected a number above 0" in refused(ShotSettings(max_error=-1).check)
     for path in (sequence.root / "inputs").glob("reference*.exr"):
         path.unlink()
     bare = open_sequence(sequence.root)
