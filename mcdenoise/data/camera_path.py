@@ -97,12 +97,8 @@ def load_camera_path(path: Path) -> CameraPath:
         InputError: the file is missing or not JSON, or a camera or object in it is invalid.
     """
     path = Path(path)
-    content: Any
-    if path.is_dir():
-        files = sorted(path.glob("*.json"), key=_last_number)
-        content = {"frames": [_read_json(file) for file in files]}
-    else:
-        content = _read_json(path)
+    files = sorted(path.glob("*.json"), key=_last_number) if path.is_dir() else []
+    content: Any = [_read_json(file) for file in files] if path.is_dir() else _read_json(path)
     if isinstance(content, list) and content:
         content = {"frames": content}
     elif isinstance(content, dict) and isinstance(content.get("camera"), dict):
@@ -191,19 +187,16 @@ def _camera(entry: dict[str, Any], content: dict[str, Any]) -> Camera:
     """The camera of a frame, by its matrix or by what it looks at."""
     fov, pose = _fov_x(entry if "fov" in entry else content, content), entry.get("transform", entry)
     if "to_world" in pose:
-        return Camera(_check_pose(np.array(pose["to_world"], dtype=np.float64)), fov)
-    camera = Camera.look_at(pose["position"], pose["look_at"], fov, pose.get("up", (0, 1, 0)))
-    return Camera(_check_pose(camera.to_world), fov)
-
-
-def _check_pose(matrix: Array) -> Array:
+        matrix = np.array(pose["to_world"], dtype=np.float64)
+    else:
+        matrix = Camera.look_at(pose["position"], pose["look_at"], fov, pose.get("up", (0, 1, 0))).to_world
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         raise ValueError(f"expected a finite 4x4 matrix, found shape {matrix.shape}")
     rotation = matrix[:3, :3]
     straight = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
     if not straight or not np.allclose(matrix[3], (0, 0, 0, 1)):
         raise ValueError("expected a rotation and a translation, without scaling or mirroring")
-    return matrix
+    return Camera(matrix, fov)
 
 
 def _fov_x(holder: dict[str, Any], conventions: dict[str, Any]) -> float:

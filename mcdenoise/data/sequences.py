@@ -56,7 +56,11 @@ def open_sequence(
 
     def chosen(present: list[int]) -> list[int]:
         gaps.extend(_gaps(present) if frames is None else [])
-        return _choose(given[0], present, frames)
+        wanted = present if frames is None else parse_frames(frames)
+        if absent := sorted(set(wanted) - set(present)):
+            found = summary(present)
+            raise InputError(f"{given[0]}: expected frame {absent[0]}, found frames {found}; choose among these")
+        return wanted
 
     where = str(given[0]) if len(given) == 1 else f"{given[0]} and {len(given) - 1} more"
     bmfr = None if by_buffer else find_bmfr(given)
@@ -158,13 +162,6 @@ def parse_frames(text: str, name: str = "frames") -> list[int]:
             raise InputError(f"{name}: expected numbers and ascending ranges such as '0-59,70', found {text[:80]!r}")
         numbers.update(range(first, last + 1))
     return sorted(numbers)
-
-
-def _choose(folder: Path, present: list[int], frames: str | None) -> list[int]:
-    chosen = present if frames is None else parse_frames(frames)
-    if absent := sorted(set(chosen) - set(present)):
-        raise InputError(f"{folder}: expected frame {absent[0]}, found frames {summary(present)}; choose among these")
-    return chosen
 
 
 def _gaps(present: list[int]) -> list[str]:

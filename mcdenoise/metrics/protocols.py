@@ -131,17 +131,14 @@ def _relmse(image: Tensor, reference: Tensor) -> Tensor:
     return ((image - reference).square() / (reference.square() + 1e-7)).mean((-3, -2, -1))
 
 
-def _luminance(shown: Tensor) -> Tensor:
-    """``(B, 1, H, W)`` luminance of values with a gamma of 2.2."""
+def _luminance_noisebase(image: Tensor) -> Tensor:
+    """``(..., 1, H, W)`` luminance of displayed values with a gamma of 2.2."""
+    shown = _show_noisebase(image)
     weights = torch.tensor(_REC709_LUMINANCE, dtype=shown.dtype, device=shown.device).reshape(3, 1, 1)
-    return (shown.reshape(-1, *shown.shape[-3:]).pow(2.2) * weights).sum(1, keepdim=True)
+    return (shown.pow(2.2) * weights).sum(-3, keepdim=True)
 
 
-def _ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
-    return ssim_of(_luminance(image), _luminance(reference)).reshape(image.shape[:-3])
-
-
-def _ms_ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
+def _ms_ssim(image: Tensor, reference: Tensor) -> Tensor:
     if min(image.shape[-2:]) <= 160:
         raise UncomputableError(
             f"MS-SSIM's five scales: expected more than 160 x 160 pixels, found {image.shape[-2]} x {image.shape[-1]}"
@@ -152,7 +149,8 @@ def _ms_ssim_luminance(image: Tensor, reference: Tensor) -> Tensor:
         raise UncomputableError(
             "MS-SSIM needs pytorch-msssim, which is not installed; pip install 'mcdenoise[peers]', or skip it"
         ) from error
-    values: Tensor = ms_ssim(_luminance(image), _luminance(reference), data_range=1.0, size_average=False)
+    flat = (each.reshape(-1, *each.shape[-3:]) for each in (image, reference))
+    values: Tensor = ms_ssim(*flat, data_range=1.0, size_average=False)
     return values.reshape(image.shape[:-3])
 
 
@@ -198,8 +196,8 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
         "range 1 of the luminance of x^2.2; without the first 16 frames, and with the middle 1024 of 1080 rows",
         {
             "PSNR": Metric(_noisebase(psnr_of), higher_is_better=True),
-            "SSIM": Metric(_noisebase(_ssim_luminance), higher_is_better=True),
-            "MS-SSIM": Metric(_noisebase(_ms_ssim_luminance), higher_is_better=True),
+            "SSIM": Metric(_of_shown(_luminance_noisebase, ssim_of), higher_is_better=True),
+            "MS-SSIM": Metric(_of_shown(_luminance_noisebase, _ms_ssim), higher_is_better=True),
             "FLIP": Metric(_noisebase(partial(flip, dynamic_range="LDR"))),
             "MSE": Metric(_noisebase(_mse)),
             "tPSNR": Metric(_noisebase(_temporal_psnr), higher_is_better=True, temporal=True),
