@@ -14,11 +14,10 @@ from torch import Tensor
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.data.images import Metadata
 from mcdenoise.data.readers.names import group_files
-from mcdenoise.data.readers.opening import open_result
+from mcdenoise.data.readers.opening import Result, open_result
 from mcdenoise.denoiser import Denoiser
-from mcdenoise.errors import InputError
+from mcdenoise.errors import InputError, naming
 from mcdenoise.evaluate.noise import as_noisy, mean_noise, recorded_noise
 from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references
 from mcdenoise.folder import denoised_frames
@@ -180,10 +179,8 @@ def evaluate_folder(
             or pixels that are not finite; or a buffer has invalid values.
     """
     check_references(sequence)
-    files = find_images(folder, sequence.reference_numbers)
-    for path in files.values():
-        check_header(path, sequence)
-    images = ((number, *_read(sequence, number, path)) for number, path in files.items())
+    files = open_images(folder, sequence, sequence.reference_numbers)
+    images = ((number, *_read(sequence, number, found)) for number, found in files.items())
     return _evaluate(sequence, folder, images, protocol, on_frame)
 
 
@@ -320,50 +317,48 @@ def _is_still(motion: Tensor) -> bool:
     return known.numel() > 0 and float(known.max()) < _STILL
 
 
-def check_header(path: Path, sequence: Sequence) -> None:
-    """Check that an image has the pixels of its sequence, or a part of them where the sequence's own files have parts.
+def open_images(folder: Path, sequence: Sequence, numbers: Collection[int]) -> dict[int, Result]:
+    """Find the radiance in the image of each frame, by number, see :func:`find_images`.
+
+    An image has the pixels of its sequence, or a part of them where the sequence's own files have parts.
 
     Raises:
-        InputError: it has others.
+        InputError: see :func:`find_images`; or an image has other pixels.
     """
-    found, whole = open_result(path), sequence.window
-    if found.size == sequence.size or (whole is not None and whole.holds(found.part.window)):
-        return
-    (height, width), size = found.size, sequence.size
-    raise InputError(
-        f"{path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; denoise at that "
-        "size"
-    )
+    images = {number: open_result(path) for number, path in find_images(folder, numbers).items()}
+    for found in images.values():
+        (height, width), size = found.size, sequence.size
+        if found.size != size and (sequence.window is None or not sequence.window.holds(found.part.window)):
+            raise InputError(
+                f"{found.path}: expected {size[1]} x {size[0]} pixels like the sequence, found {width} x {height}; "
+                "denoise at that size"
+            )
+    return images
 
 
-def read_image(path: Path, sequence: Sequence) -> tuple[Tensor, Metadata]:
-    """Read a denoised image of a sequence, ``(1, 3, H, W)``, and the attributes of its file.
+def read_image(found: Result, sequence: Sequence) -> Tensor:
+    """Read a denoised image of a sequence, ``(1, 3, H, W)``, converted to the primaries of Rec. 709.
 
     Raises:
-        InputError: it is damaged, or has pixels that are not finite.
+        InputError: it is damaged, has pixels that are not finite, or states invalid primaries.
     """
-    found = open_result(path)
-    image, metadata = found.read(None if found.size == sequence.size else sequence.window)
+    image = found.read(None if found.size == sequence.size else sequence.window)
     bad = ~torch.isfinite(image).all(1)[0]
     if bad.any():
         row, column = bad.nonzero()[0].tolist()
         raise InputError(
-            f"{path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, first at "
-            f"row {row}, column {column}; errors are undefined for such pixels: repair them, or skip the frame"
+            f"{found.path}: expected finite pixels, found {int(bad.sum())} NaN or infinite ones of {bad.numel()}, "
+            f"first at row {row}, column {column}; errors are undefined for such pixels: repair them, or skip the frame"
         )
-    return image, metadata
+    with naming(str(found.path)):
+        return to_rec709(image, found.metadata)
 
 
-def _read(sequence: Sequence, number: int, path: Path) -> tuple[Tensor, Frame, Tensor]:
+def _read(sequence: Sequence, number: int, found: Result) -> tuple[Tensor, Frame, Tensor]:
     """Read image, frame and reference; both images are converted to the primaries of Rec. 709."""
-    image, metadata = read_image(path, sequence)
-    try:
+    image = read_image(found, sequence)
+    with naming(f"{sequence.root}, frame {number}"):
         frame, _ = sequence.frame(number).with_depth().validate()
-    except InputError as error:
-        raise InputError(f"{sequence.root}, frame {number}: {error}") from error
-    if frame.reference is None:
-        raise InputError(f"{sequence.root}: expected the reference of frame {number}, found none; render it")
-    try:
-        return to_rec709(image, metadata), frame, to_rec709(frame.reference, sequence.metadata(number))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+        if frame.reference is None:
+            raise InputError("expected a reference, found none; render it")
+        return image, frame, to_rec709(frame.reference, sequence.metadata(number))

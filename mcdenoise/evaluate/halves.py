@@ -14,8 +14,8 @@ from torch.nn import functional
 
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
-from mcdenoise.errors import InputError
-from mcdenoise.evaluate.folder import check_header, find_images, read_image
+from mcdenoise.errors import InputError, naming
+from mcdenoise.evaluate.folder import open_images, read_image
 
 NOISY = "noisy"
 # Sides of the squares whose difference is the surroundings of a pixel. Pixel filters reach less far than the inner one.
@@ -101,10 +101,7 @@ def evaluate_halves(
             f"--half {other.root}: expected the frames of {sequence.root} with another seed, of {_SMALLEST * 4} x "
             f"{_SMALLEST * 4} pixels or more, found {_described(other)} for {_described(sequence)}"
         )
-    files = {name: find_images(path, sequence.numbers) for name, path in images.items()}
-    for each in files.values():
-        for path in each.values():
-            check_header(path, sequence)
+    files = {name: open_images(path, sequence, sequence.numbers) for name, path in images.items()}
     result, closer = Halves(str(sequence.root), str(other.root)), dict.fromkeys(files, torch.zeros(1))
     for number, others in numbers.items():
         first, second = _color(sequence, number), _color(other, others)
@@ -116,7 +113,7 @@ def evaluate_halves(
         weight, noise = weights(first, second), (first - second).square() / 2
         squares = {NOISY: noise}
         for name, paths in files.items():
-            image = to_rec709(*read_image(paths[number], sequence)).double()
+            image = read_image(paths[number], sequence).double()
             squares[name] = (image - second).square() - noise
             gain = (image - second).square() - (image - first).square()
             closer[name] = closer[name] + _blocks(weight * gain)
@@ -168,11 +165,9 @@ def _mean(sums: Tensor, pixels: Tensor) -> tuple[float, float]:
 
 
 def _color(sequence: Sequence, number: int) -> Tensor:
-    try:
+    with naming(f"{sequence.root}, frame {number}"):
         frame = sequence.frame(number, reference=False).validate()[0]
         return to_rec709(frame.color.double(), sequence.metadata(number))
-    except InputError as error:
-        raise InputError(f"{sequence.root}, frame {number}: {error}") from error
 
 
 def _described(sequence: Sequence) -> str:

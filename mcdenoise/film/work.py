@@ -177,7 +177,8 @@ def look(shot: Shot, out: Path) -> Found:
             # From the files, since frames were denoised in any order.
             shown = settings.preview_in(opened.folder, video=len(records) > 1)
             for path in report.files.values():
-                shown.add(path.stem, *_result(path, settings).read(sequence.window))
+                result = _result(path, settings)
+                shown.add(path.stem, result.read(sequence.window), result.metadata)
             shown.close()
     warnings = (*sequence.warnings, *(report.warnings if records else []))
     return replace(found, missing=missing, pictures=tuple(_pictures(out, found.shot, report.files)), warnings=warnings)
@@ -194,8 +195,9 @@ def _pictures(out: Path, shot: Shot, files: dict[int, Path]) -> Iterable[tuple[i
     for place in np.linspace(0, len(numbers) - 1, min(_PICTURES, len(numbers))).round().astype(int):
         # A picture that cannot be made is missing on the page, and nothing else.
         with suppress(InputError):
-            image, metadata = _result(files[numbers[place]], shot.settings).read()
-            shown.add(f"{numbers[place]}", avg_pool2d(image, -(-max(image.shape) // _SIDE), ceil_mode=True), metadata)
+            result = _result(files[numbers[place]], shot.settings)
+            small = avg_pool2d(result.read(), -(-max(result.size) // _SIDE), ceil_mode=True)
+            shown.add(f"{numbers[place]}", small, result.metadata)
             yield numbers[place], os.path.relpath(shown.written[-1], out)
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from mcdenoise.data.camera_matrices import find_camera_matrices
@@ -35,7 +34,7 @@ from mcdenoise.data.readers.diffuse_specular import (
     find_splits,
 )
 from mcdenoise.data.readers.examining import examine, examine_parts
-from mcdenoise.data.readers.files import RenderedFiles
+from mcdenoise.data.readers.files import RenderedFiles, as_tensor
 from mcdenoise.data.readers.layers import Layer, layers_of, read_files, recognise
 from mcdenoise.data.readers.lights import ALL, WHOLE, find_lights, is_light
 from mcdenoise.data.readers.names import FileGroup, files_beside, pattern_of, patterns_of
@@ -120,19 +119,21 @@ class Result:
         path: the file.
         layer: layer of the radiance.
         part: the part of the file that has it.
+        metadata: attributes of the file.
     """
 
     path: Path
     layer: Layer
     part: Part
+    metadata: Metadata
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
         return self.part.window.size
 
-    def read(self, window: Window | None = None) -> tuple[Tensor, Metadata]:
-        """Read ``(1, 3, H, W)`` radiance, thrice the same from one channel, and the attributes of the file.
+    def read(self, window: Window | None = None) -> Tensor:
+        """Read ``(1, 3, H, W)`` radiance, thrice the same from one channel.
 
         Args:
             window: what to read instead of the data window; 0 where that has no pixels.
@@ -144,8 +145,7 @@ class Result:
         pixels = np.repeat(pixels, 3, -1) if pixels.shape[2] == 1 else pixels
         pixels = light_of(pixels, self.part)[..., :3]
         pixels = pixels if window is None else window.of(pixels, self.part.window)
-        image = torch.from_numpy(pixels).permute(2, 0, 1)[None].contiguous()
-        return image, read_image_header(self.path).metadata
+        return as_tensor(pixels)
 
 
 def open_result(path: Path, layer: str | None = None, color_space: ColorSpace = "auto") -> Result:
@@ -159,10 +159,11 @@ def open_result(path: Path, layer: str | None = None, color_space: ColorSpace = 
     Raises:
         InputError: the file cannot be read, or its radiance cannot be determined.
     """
-    parts, mapping = _parts(read_image_header(path), color_space), {} if layer is None else {"color": layer}
+    header, mapping = read_image_header(path), {} if layer is None else {"color": layer}
+    parts = _parts(header, color_space)
     chosen = choose(str(path), layers_of(0, "", parts), mapping, functools.partial(read_files, lambda _: path))
     found = chosen.written[0]
-    return Result(path, found, parts[found.part])
+    return Result(path, found, parts[found.part], header.metadata)
 
 
 def _check_files(shot: RenderedFiles, splits: Sequence[Split], samples: SampleLayers) -> set[Layer]:

@@ -171,7 +171,7 @@ def test_colors_that_are_not_multiplied_by_alpha_are_light_that_is(name: str, tm
     after = stored(result)
     np.testing.assert_allclose(after[..., 3:], halved, atol=1e-5)
     np.testing.assert_allclose(after[..., :3], before[..., :3], rtol=2e-3, atol=1e-5)
-    np.testing.assert_allclose(open_result(result).read()[0][0].movedim(0, -1), color / 2, rtol=5e-3, atol=1e-5)
+    np.testing.assert_allclose(open_result(result).read()[0].movedim(0, -1), color / 2, rtol=5e-3, atol=1e-5)
 
 
 def test_straight_colors_stay_the_same_to_the_rim(tmp_path: Path) -> None:
