@@ -81,8 +81,7 @@ def denoise_sequence(
             cannot be written to, or memory is insufficient. Frames before the one that the message names are written.
     """
     prepare_folder(sequence, out)
-    report = new_report(sequence, model, picked)
-
+    report = SequenceReport(model, sequence.color_has_albedo, picked)
     write_frames(
         sequence,
         out,
@@ -96,18 +95,6 @@ def denoise_sequence(
     )
     write_report(sequence, out, denoiser, report)
     return report
-
-
-def new_report(sequence: Sequence, model: str, picked: str = "") -> SequenceReport:
-    """An empty report.
-
-    Args:
-        sequence: the frames.
-        model: name of the model.
-        picked: see :class:`SequenceReport`.
-    """
-    stored = "with albedo" if sequence.color_has_albedo else "without albedo, which the reader multiplies back"
-    return SequenceReport(model, f"color is stored {stored}", picked)
 
 
 def write_frames(

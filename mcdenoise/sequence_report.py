@@ -15,7 +15,7 @@ class SequenceReport:
 
     Args:
         model: name of the model with its settings, or path of its weights.
-        reading: how the sequence stores its color.
+        with_albedo: whether the sequence stores its color with the albedo.
         picked: the model that limits of run time or error have picked, and why; empty without limits.
         frames: report of each frame, by number; run times include waiting for the disk.
         files: the written file of each frame, by number.
@@ -24,7 +24,7 @@ class SequenceReport:
     """
 
     model: str
-    reading: str
+    with_albedo: bool
     picked: str = ""
     frames: dict[int, FrameReport] = field(default_factory=dict)
     files: dict[int, Path] = field(default_factory=dict)
@@ -54,7 +54,8 @@ class SequenceReport:
     @property
     def plan(self) -> list[dict[str, Any]]:
         """For each stage, whether it was computed, how much of it was skipped, and why, see :func:`summarize`."""
-        read = Stage("read", 0.0, self.reading)
+        stored = "with albedo" if self.with_albedo else "without albedo, which the reader multiplies back"
+        read = Stage("read", 0.0, f"color is stored {stored}")
         return summarize([[read, *report.stages.values()] for report in self.frames.values()])
 
     @property

@@ -35,13 +35,14 @@ from mcdenoise.data.sequences import frame_numbers
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import PICTURES, RECORDS, Shot
-from mcdenoise.folder import FrameError, new_report, prepare_folder, write_frames, write_report
+from mcdenoise.folder import FrameError, prepare_folder, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
 from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._weights import find_weights
 from mcdenoise.preview import Preview
 from mcdenoise.reading import read_bytes
+from mcdenoise.sequence_report import SequenceReport
 from mcdenoise.shot import ShotSettings
 
 # Largest difference of a frame from that of the uncut shot, as a fraction; it decides where a piece begins.
@@ -167,10 +168,14 @@ def look(shot: Shot, out: Path) -> Found:
     for number in missing:
         remove(opened.records / f"{number}.json")
     settings, spelling = found.shot.settings, found.shot.settings.spelling
-    report = new_report(sequence, str(spelling.weights or spelling.name), found.shot.picked)
-    report.frames = {number: each.report for number, each in records.items()}
-    report.files = {number: opened.folder / each.file for number, each in records.items()}
-    report.alike = [number for number, each in records.items() if each.alike]
+    report = SequenceReport(
+        str(spelling.weights or spelling.name),
+        sequence.color_has_albedo,
+        found.shot.picked,
+        frames={number: each.report for number, each in records.items()},
+        files={number: opened.folder / each.file for number, each in records.items()},
+        alike=[number for number, each in records.items() if each.alike],
+    )
     if not missing and not found.unreadable:
         write_report(sequence, opened.folder, opened.denoiser, report)
         if settings.preview:
@@ -233,7 +238,7 @@ def make(shot: Shot, out: Path, piece: Piece) -> dict[int, str]:
 
 def _write(opened: Opened, numbers: tuple[int, ...], left: set[int], keys: dict[int, str]) -> None:
     """Denoise frames, write those that are left, and record each as it is finished, which takes it from them."""
-    report = new_report(opened.sequence, "")
+    report = SequenceReport("", opened.sequence.color_has_albedo)
 
     def finished(number: int, image: Tensor) -> None:
         """Called in the thread that has written the file."""
