@@ -102,10 +102,10 @@ def check_values(name: str, value: Tensor) -> Tensor:
     if not -_UNBOUNDED < low <= high < _UNBOUNDED and (bad := _illegal(spec, value)).any():
         where = bad.nonzero()[0].tolist()
         place = f"first at row {where[2]}, column {where[3]}" if len(where) == 4 else f"first at {where[1:]}"
-        _refuse_illegal(name, int(bad.sum()), f", {place}")
+        _judge(name, low, high, int(bad.sum()), place=f", {place}")
     if low >= spec.low and high <= spec.high:
         return value
-    _refuse_range(name, low, high, float(_above(spec, value)) if high > _limit(spec) else 0.0)
+    _judge(name, low, high, above=float(_above(spec, value)) if high > _limit(spec) else 0.0)
     return value.clamp(spec.low, spec.high)
 
 
@@ -129,11 +129,7 @@ def clamped(
     def judge(read: Sequence[float]) -> None:
         found = iter(read)
         for name in buffers:
-            low, high, count, above = (next(found) for _ in range(4))
-            if count:
-                _refuse_illegal(name, int(count))
-            if low < _spec_of(name).low or high > _spec_of(name).high:
-                _refuse_range(name, low, high, above)
+            _judge(name, *(next(found) for _ in range(4)))
 
     return changes, numbers, judge
 
@@ -158,19 +154,16 @@ def _illegal(spec: BufferSpec, value: Tensor) -> Tensor:
     return ~torch.isfinite(value)
 
 
-def _refuse_illegal(name: str, count: int, place: str = "") -> None:
+def _judge(name: str, low: float, high: float, illegal: float = 0, above: float = 0, *, place: str = "") -> None:
+    """Reject a number of illegal values, or a range; warn if the fraction ``above`` its limit is small."""
     spec = _spec_of(name)
-    expected = "finite values or inf" if spec.infinite else "finite values"
-    advice = "set them to inf where there is none" if spec.infinite else "render the buffer again"
-    raise InputError(
-        f"buffer '{name}': expected {expected} ({spec.meaning}), "
-        f"found {count} NaN or infinite ones{place}; {advice}, or leave the buffer out"
-    )
-
-
-def _refuse_range(name: str, low: float, high: float, above: float) -> None:
-    """Reject a range, or warn if the fraction ``above`` the limit is small enough to be clamped."""
-    spec = _spec_of(name)
+    if illegal:
+        expected = "finite values or inf" if spec.infinite else "finite values"
+        advice = "set them to inf where there is none" if spec.infinite else "render the buffer again"
+        raise InputError(
+            f"buffer '{name}': expected {expected} ({spec.meaning}), "
+            f"found {illegal:.0f} NaN or infinite ones{place}; {advice}, or leave the buffer out"
+        )
     # Single large reflectances are the fault of a pixel; if most are large, the buffer has another unit or content.
     forgiven = high > _limit(spec) and spec.forgiven and above < 0.5
     if forgiven:

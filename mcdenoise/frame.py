@@ -29,7 +29,7 @@ from mcdenoise.light import Repairs, is_valid, repair, repairs_from
 
 # The vocabulary of buffers belongs to frames.
 __all__ = ["BUFFERS", "LAYOUTS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Layout"]
-__all__ += ["Skip", "Unread", "scale_samples", "tells_motion"]
+__all__ += ["Skip", "scale_samples", "tells_motion"]
 
 
 class Hints(NamedTuple):
@@ -318,9 +318,9 @@ class Frame:
         changes: dict[str, Any] = {}
         repairs = Repairs()
         if not all(map(is_valid, (self.color, *self.layers.values()))):
-            repaired = repair(self.color, self.layers, reads=True)
-            repairs = repairs_from(repaired.numbers.tolist(), list(self.layers))
-            changes |= {"color": repaired.color, "layers": repaired.layers}
+            color, layers, numbers = repair(self.color, self.layers, reads=True)
+            repairs = repairs_from(numbers.tolist(), list(layers))
+            changes |= {"color": color, "layers": layers}
         for name, value in self.items():
             if name != "color":
                 clean = check_values(name, value)
@@ -328,28 +328,26 @@ class Frame:
                     changes[name] = clean
         return self.replace(**changes) if changes else self, repairs
 
-    def repaired(self) -> Unread:
+    def repaired(self) -> tuple[Frame, Tensor, Callable[[Sequence[float]], Repairs]]:
         """Like :meth:`validate` without waiting for the device: repair everything, and read nothing.
 
         Returns:
-            The frame, numbers that tell which values were invalid, and a function that judges these numbers once they
-            have been read: it raises the errors of :meth:`validate`. The frame keeps values that would be rejected,
-            except that they are clamped to their range.
+            The frame, numbers ``(N,)`` on its device that tell which values were invalid, and a function that judges
+            these numbers once they have been read: it raises the errors of :meth:`validate`. The frame keeps values
+            that would be rejected, except that they are clamped to their range.
         """
-        repaired, layers = repair(self.color, self.layers, reads=False), list(self.layers)
+        color, layers, of_light = repair(self.color, self.layers, reads=False)
         others = {name: value for name, value in self.items() if name != "color"}
         changes, numbers, judge_others = clamped(others)
-        of_light = len(repaired.numbers)
 
         def judge(read: Sequence[float]) -> Repairs:
-            repairs = repairs_from(read[:of_light], layers)
-            judge_others(read[of_light:])
+            repairs = repairs_from(read[: len(of_light)], list(layers))
+            judge_others(read[len(of_light) :])
             return repairs
 
         # Created on the device, because copying a number from the host would wait.
-        numbers = [number.to(repaired.numbers.dtype)[None] for number in numbers]
-        frame = self.replace(color=repaired.color, layers=repaired.layers, **changes)
-        return Unread(frame, torch.cat([repaired.numbers, *numbers]), judge)
+        numbers = [number.to(of_light.dtype)[None] for number in numbers]
+        return self.replace(color=color, layers=layers, **changes), torch.cat([of_light, *numbers]), judge
 
 
 _OF_HOSTS = ("extra", "layers", "statistics", "skip")
@@ -412,20 +410,3 @@ def _check_layer(name: str, layer: object, color: Tensor) -> None:
             f"layer '{name}': expected shape {tuple(color.shape)} on {color.device} like 'color', found "
             f"{tuple(layer.shape)} on {layer.device}"
         )
-
-
-class Unread(NamedTuple):
-    """A repaired frame, and numbers that tell which of its values were invalid; nothing has been read from the device.
-
-    Args:
-        frame: with valid values, as far as they can be repaired.
-        numbers: ``(N,)`` on the frame's device.
-        judge: takes the numbers after they have been read, and returns what was invalid in ``color``.
-
-    Raises:
-        InputError: raised by ``judge``, with the errors of :meth:`Frame.validate`.
-    """
-
-    frame: Frame
-    numbers: Tensor
-    judge: Callable[[Sequence[float]], Repairs]

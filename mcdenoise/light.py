@@ -68,20 +68,6 @@ class Repairs(NamedTuple):
         )
 
 
-class Repaired(NamedTuple):
-    """Valid images, and numbers that tell what was invalid: nothing has been read from the device.
-
-    Args:
-        color: ``(B, C, H, W)``.
-        layers: ``(B, C, H, W)`` each.
-        numbers: ``(N,)`` for :func:`repairs_from`.
-    """
-
-    color: Tensor
-    layers: Mapping[str, Tensor]
-    numbers: Tensor
-
-
 def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
     """Replace radiance that is NaN, infinite, negative or too large, so that it does not spread.
 
@@ -112,8 +98,8 @@ def replace_invalid(color: Tensor) -> tuple[Tensor, int]:
     """
     if is_valid(color):
         return color, 0
-    repaired = repair(color, {}, reads=True)
-    return repaired.color, repairs_from(repaired.numbers.tolist(), ()).pixels
+    clean, _, numbers = repair(color, {}, reads=True)
+    return clean, repairs_from(numbers.tolist(), ()).pixels
 
 
 def is_valid(image: Tensor) -> bool:
@@ -122,7 +108,7 @@ def is_valid(image: Tensor) -> bool:
     return bool(low >= 0 and high <= LARGEST_RADIANCE and high < torch.inf)
 
 
-def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> Repaired:
+def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> tuple[Tensor, Mapping[str, Tensor], Tensor]:
     """Apply :func:`replace_invalid` to a color and layers that are parts of it, so that their sums stay.
 
     A pixel without a value in any of them is filled in all. An infinite or negative layer is what the color has beyond
@@ -132,6 +118,9 @@ def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> Repai
         color: ``(B, C, H, W)``.
         layers: ``(B, C, H, W)`` by name.
         reads: whether values may be read on the host, to leave out what is not needed.
+
+    Returns:
+        The valid color and layers, and numbers ``(N,)`` on their device for :func:`repairs_from`.
     """
     hole = _hole(color)
     usable = ~(hole | _high(color).any(1, keepdim=True))
@@ -174,12 +163,13 @@ def repair(color: Tensor, layers: Mapping[str, Tensor], *, reads: bool) -> Repai
     images = [clean, *parts.values()]
     if not reads or bool(hole.any()):
         images = [by_rows(_from_neighbours, image, hole, reach=1) for image in images]
-        alone = by_rows(_without_neighbours, hole, reach=1)
+        # In the middle of 3x3 holes.
+        alone = by_rows(lambda hole: F.max_pool2d((~hole).float(), 3, 1, 1) == 0, hole, reach=1)
         if not reads or bool(alone.any()):
             images = [torch.where(alone, filled(image, ~alone), image) for image in images]
     dtype = torch.promote_types(color.dtype, torch.float32)
     stacked = torch.stack([number.to(dtype) for number in (*numbers, *of_layers)])
-    return Repaired(images[0], dict(zip(parts, images[1:], strict=True)), stacked)
+    return images[0], dict(zip(parts, images[1:], strict=True)), stacked
 
 
 def filled(image: Tensor, known: Tensor) -> Tensor:
@@ -294,8 +284,3 @@ def _from_neighbours(image: Tensor, hole: Tensor) -> Tensor:
     total = F.avg_pool2d(torch.where(hole, 0, image).to(dtype) / 9, 3, 1, 1, divisor_override=1)
     count = F.avg_pool2d((~hole).to(dtype), 3, 1, 1, divisor_override=1)
     return torch.where(hole, (total * (9 / count.clamp_min(1))).to(image.dtype), image)
-
-
-def _without_neighbours(hole: Tensor) -> Tensor:
-    """Holes in the middle of 3x3 holes."""
-    return F.max_pool2d((~hole).float(), 3, 1, 1) == 0

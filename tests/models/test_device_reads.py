@@ -101,7 +101,7 @@ def test_a_step_runs_without_any_values(name: str) -> None:
         model.to("meta")
     state = None
     for frame in frames:
-        output, state = model(frame.to("meta").repaired().frame, state)
+        output, state = model(frame.to("meta").repaired()[0], state)
         assert output.image.shape == (1, 3, *SIZE)
         assert output.image.device.type == "meta"
 
@@ -216,14 +216,15 @@ def test_repairs_are_those_of_validation() -> None:
     frame.color[0, 0, 20, 30:33] = -1
     frame = frame.replace(albedo=frame.albedo * 1.9, normal=frame.normal * 1.001, layers={"half": frame.color / 2})
     expected, count = frame.validate()
-    repaired = frame.repaired()
-    assert repaired.judge(repaired.numbers.tolist()).pixels == count == 4
+    repaired, numbers, judge = frame.repaired()
+    assert judge(numbers.tolist()).pixels == count == 4
     for name, value in expected.items():
-        assert torch.equal(value, repaired.frame.buffer(name)), name
-    assert torch.equal(repaired.frame.layers["half"], expected.layers["half"])
-    late = frame.replace(albedo=torch.where(frame.depth == torch.inf, 9, 0.5).expand(-1, 3, -1, -1)).repaired()
+        assert torch.equal(value, repaired.buffer(name)), name
+    assert torch.equal(repaired.layers["half"], expected.layers["half"])
+    late = frame.replace(albedo=torch.where(frame.depth == torch.inf, 9, 0.5).expand(-1, 3, -1, -1))
+    _, numbers, judge = late.repaired()
     with pytest.warns(UserWarning, match="buffer 'albedo'"):
-        late.judge(late.numbers.tolist())
+        judge(numbers.tolist())
 
 
 class Event:
