@@ -51,13 +51,13 @@ def optional_values() -> ConstructorRegistry:
     return registry
 
 
-def parse_size(text: str, option: str = "--size") -> tuple[int, int]:
-    """Parse the width and height of an option.
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse the width and height of ``--size``.
 
     Raises:
         InputError: the text is not of the form WIDTHxHEIGHT.
     """
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal()):
-        raise InputError(f"{option}: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
     return int(width), int(height)

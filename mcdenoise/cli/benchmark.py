@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,16 +16,30 @@ from mcdenoise.benchmark.sizes import SIZES
 from mcdenoise.benchmark.tables import op_rows, remarks, scene_rows, skipped_rows
 from mcdenoise.check.cases import OPS
 from mcdenoise.check.own import find_ops
-from mcdenoise.cli._options import Json, parse_size
-from mcdenoise.cli._output import print_rows, say, steps_of, warn, write_json
-from mcdenoise.cli._suite import score_suite
+from mcdenoise.cli._options import Json
+from mcdenoise.cli._output import print_rows, progress_bar, say, steps_of, warn, write_json
 from mcdenoise.data import open_sequence
+from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import Spelling
-from mcdenoise.report import check_packages, write_report
+from mcdenoise.models import DEFAULT
+from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.results import FILE
 from mcdenoise.shot import check_threads
+from mcdenoise.suite import (
+    SHOWN,
+    choose_rows,
+    error_against_time,
+    lines_of,
+    markdown,
+    open_row,
+    render_suite,
+    rows_there,
+    sample_curves,
+    with_peers,
+    write_close_ups,
+)
 
 
 def benchmark(
@@ -89,24 +103,20 @@ def benchmark(
     check_threads(threads)
     command = _command_line({name: value for name, value in locals().items() if name != "json"})
     rounds = rounds if rounds is not None else 5 if ops else 1 if suite else 3
-    if ops and suite is None:
-        return _time_ops(
-            sequences, parse_size(sizes or "1280x720", "--sizes"), rounds, threads, device, out, command, json
-        )
     settings = Settings(
         rounds=rounds,
         threads=threads,
         device=device,
-        sizes=tuple(parse_sizes(SIZES if sizes is None else sizes)),
+        sizes=tuple(parse_sizes(sizes if sizes is not None else "1280x720" if ops else SIZES)),
         pictures=pictures,
         command=command,
     )
+    if ops and suite is None:
+        return _time_ops(sequences, out, settings, json)
     if suite is not None:
         if ops or sequences:
             raise InputError("--suite: expected neither folders of sequences nor --ops with it, found one of them")
-        if data is None:
-            raise InputError("--data: expected the folder of the suite's frames, found none; give one")
-        return score_suite(data, out, settings, rows, models, precisions or "float32", render=render, json=json)
+        return _score_suite(data, out, settings, rows, models, precisions, render, json)
     if not sequences:
         if out is None or not os.path.exists(out / FILE):
             raise InputError("expected folders of sequences, or --ops, found neither; see `mcdenoise benchmark --help`")
@@ -131,24 +141,17 @@ def benchmark(
     return 1 if results.failed else 0
 
 
-def _time_ops(
-    names: list[Path],
-    size: tuple[int, int],
-    rounds: int,
-    threads: int,
-    device: str,
-    out: Path | None,
-    command: str,
-    json: Json,
-) -> int:
+def _time_ops(names: list[Path], out: Path | None, settings: Settings, json: Json) -> int:
+    if len(settings.sizes) != 1:
+        raise InputError(f"--sizes: expected one size with --ops, found {len(settings.sizes)}")
     with steps_of("ops") as on_step:
         costs = benchmark_ops(
-            size=size,
-            rounds=rounds,
-            threads=threads,
-            device=device,
+            size=settings.sizes[0],
+            rounds=settings.rounds,
+            threads=settings.threads,
+            device=settings.device,
             out=out,
-            command=command,
+            command=settings.command,
             ops=find_ops([str(name) for name in names] or None, OPS),
             on_step=on_step,
         )
@@ -156,6 +159,65 @@ def _time_ops(
     print(f"a copy moves {costs.bandwidth:.1f} GB/s, reading and writing")
     write_json(json, asdict(costs))
     return 0
+
+
+def _score_suite(
+    data: Path | None,
+    out: Path | None,
+    settings: Settings,
+    rows: str | None,
+    models: str | None,
+    precisions: str | None,
+    render: bool,
+    json: Path | None,
+) -> int:
+    """Render missing frames of the suite, score the methods on its rows, and write the tables."""
+    if data is None:
+        raise InputError("--data: expected the folder of the suite's frames, found none; give one")
+    chosen = choose_rows(rows)
+    settings = replace(settings, sizes=(), pictures=1, metrics=SHOWN, memory=False)
+    if out is None and not render:
+        raise InputError("--out: expected a folder to write to with --no-render, found none; give one with -o")
+    # Report errors in the choice of methods before hours of rendering.
+    named = with_peers(models or DEFAULT)
+    methods = choose_methods(named, precisions=precisions or "float32", baselines=("noisy",))
+    if out is not None:
+        check_packages()
+    with progress_bar() as progress:
+        task = progress.add_task("render", total=None)
+
+        def show(shot: str, fraction: float, done: int, total: int) -> None:
+            described = f"render {shot}, references to {fraction:.0%}"
+            progress.update(task, description=described, completed=done, total=total)
+
+        if render:
+            wanted = dict.fromkeys(row.shot for row in chosen)
+            render_suite(wanted, data, threads=settings.threads, on_step=show)
+    if out is None:
+        say(data)
+        return 0
+    found = rows_there(chosen, data)
+    if not found:
+        raise InputError(f"{data}: expected frames of the suite, found none; omit --no-render to render them")
+    missing = [row.name for row in chosen if row not in found]
+    with steps_of("score") as on_step:
+        shots = [open_row(row, data) for row in found]
+        results = run_benchmark(shots, methods, out, settings, on_step=on_step)
+    lines, curves = lines_of(results, found), lines_of(results, found, curve=True)
+    ours = dict.fromkeys(line.model for line in lines)
+    text = markdown(lines, curves, *error_against_time(results, found))
+    write_text(out / "suite.md", text)
+    content = {"lines": [asdict(line) for line in lines], "curves": [asdict(line) for line in curves]}
+    write_json(out / "suite.json", content)
+    write_json(json, content)
+    write_sample_plots(sample_curves(curves), out)
+    best = {line.best["SMAPE"].setting: None for line in lines if line.best}
+    write_close_ups(out, results, found, ["noisy", *ours, *best])
+    print(text)
+    for line in [*remarks(results), *([f"not rendered: {', '.join(missing)}"] if missing else [])]:
+        say(line)
+    say(f"tables: {out / 'suite.md'}, close-ups: {out / 'close-ups'}, report: {write_report(out)}")
+    return 1 if results.failed else 0
 
 
 def _command_line(options: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from collections.abc import Sequence as Sequential
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,8 @@ import tyro
 from torch import Tensor
 
 from mcdenoise import ops
-from mcdenoise.cli._options import Inputs, Json, Out
+from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out
 from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_of, warn, write_json
-from mcdenoise.cli._shot import ShotOptions
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
@@ -36,6 +36,18 @@ from mcdenoise.shot import ShotSettings
 _NOT_WRITTEN = {".jpg", ".jpeg", ".bmp", ".tga", ".gif", ".webp", ".jp2", ".dpx", ".psd", ".mp4", ".mov"}
 # Loading numba takes 0.9 s, which is what the shipped networks gain from it on a still of three million pixels.
 _SMALL_STILL = 1920 * 1080
+
+
+@dataclass(frozen=True)
+class ShotOptions(ShotSettings):
+    """:class:`mcdenoise.shot.ShotSettings` as command-line options; overrides the parsing of some fields."""
+
+    map: Map = ()
+    color_without_albedo: Flag = False
+    color_with_albedo: Flag = False
+    input_linear: Flag = False
+    layers: Layers = ()
+    alpha: Flag = False
 
 
 def denoise(
