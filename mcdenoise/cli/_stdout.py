@@ -2,50 +2,33 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from typing import Any, TextIO
+from contextlib import contextmanager
+from typing import Any
 
 from mcdenoise.errors import InputError
 
 
-class _Forgiving:
-    """A stream that discards output after a failed write; the first failure is stored.
+class _Forgiving(io.FileIO):
+    """A file whose descriptor is that of the null device after a failed write; the first failure is stored."""
 
-    Args:
-        stream: the stream of a file, whose descriptor is redirected to the null device after a failure.
-    """
+    failure: OSError | None = None
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self.failure: OSError | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
+    def write(self, content: Any) -> int:
         try:
-            return self._stream.write(text)
+            if (written := super().write(content)) is not None:
+                return written
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         except OSError as error:
-            self._failed(error)
-            return len(text)
-
-    def flush(self) -> None:
-        try:
-            self._stream.flush()
-        except OSError as error:
-            self._failed(error)
-
-    def _failed(self, error: OSError) -> None:
-        self.failure = self.failure or error
+            self.failure = self.failure or error
         null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, self._stream.fileno())
+        os.dup2(null, self.fileno())
         os.close(null)
-        # Discard the content of its buffer too.
-        with suppress(OSError):
-            self._stream.flush()
+        return memoryview(content).nbytes
 
 
 @contextmanager
@@ -56,20 +39,24 @@ def forgiving_stdout() -> Iterator[None]:
         InputError: at the end, if writing failed for another reason, such as a full disk.
     """
     stdout = sys.stdout
-    # Leave a stream alone with which other code has replaced stdout.
-    if stdout is not sys.__stdout__ or stdout is None:
+    # Leave a stream alone with which other code has replaced stdout, and a console that is no file.
+    if stdout is not sys.__stdout__ or not isinstance(stdout, io.TextIOWrapper):
         yield
         return
+    if not isinstance(getattr(stdout.buffer, "raw", stdout.buffer), io.FileIO):
+        yield
+        return
+    file = _Forgiving(stdout.fileno(), "wb", closefd=False)
     # Like Python's stderr, escape characters that the encoding lacks.
-    stdout.reconfigure(errors="backslashreplace")
-    sys.stdout = forgiving = _Forgiving(stdout)
+    sys.stdout = forgiving = io.TextIOWrapper(
+        io.BufferedWriter(file), stdout.encoding, "backslashreplace", line_buffering=stdout.line_buffering
+    )
+    forgiving.reconfigure(write_through=stdout.write_through)
     try:
         yield
     finally:
         forgiving.flush()
         sys.stdout = stdout
-    if forgiving.failure is not None and not isinstance(forgiving.failure, BrokenPipeError):
-        reason = forgiving.failure.strerror
-        raise InputError(
-            f"standard output: cannot be written ({reason}); everything else is done"
-        ) from forgiving.failure
+    if file.failure is not None and not isinstance(file.failure, BrokenPipeError):
+        reason = file.failure.strerror
+        raise InputError(f"standard output: cannot be written ({reason}); everything else is done") from file.failure
