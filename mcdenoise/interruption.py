@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 # The environment variable for the option -P of Python.
@@ -119,13 +120,13 @@ def prepare_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)):
         if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _end_worker)
+            signal.signal(number, lambda number, frame: _end(128 + number))
     threading.Thread(target=_end_with_driver, daemon=True).start()
 
 
-def _end_worker(number: int, frame: FrameType | None) -> None:
+def _end(status: int) -> NoReturn:
     remove_unfinished()
-    os._exit(128 + number)
+    os._exit(status)
 
 
 def _end_with_driver() -> None:
@@ -135,8 +136,7 @@ def _end_with_driver() -> None:
     driver = multiprocessing.parent_process()
     if driver is not None:
         driver.join()
-        remove_unfinished()
-        os._exit(1)
+        _end(1)
 
 
 class Interruption:
@@ -192,16 +192,12 @@ class Interruption:
         os.close(self._pipe[1])
         self._pipe = None
 
-    def status(self, otherwise: int) -> int:
-        """The exit status: that of the signal, if there was one, else the given one."""
-        return 128 + self.number if self.number else otherwise
-
     def _heard(self, number: int, frame: FrameType | None) -> None:
         again, self.number = bool(self.number), number
         self._say(number)
         # An import has nothing to clean up, and modules rarely handle exceptions while they are imported.
         if again or not self.listening or _is_importing(frame):
-            self._end(number)
+            _end(128 + number)
         if _starts.active:
             _starts.interrupted = True
             return
@@ -218,7 +214,7 @@ class Interruption:
             if heard[0] in self._before:
                 time.sleep(_GRACE)
                 self._say(heard[0])
-                self._end(heard[0])
+                _end(128 + heard[0])
         os.close(reading)
 
     def _say(self, number: int) -> None:
@@ -235,10 +231,6 @@ class Interruption:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, 2)
             os.close(nowhere)
-
-    def _end(self, number: int) -> None:
-        remove_unfinished()
-        os._exit(128 + number)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

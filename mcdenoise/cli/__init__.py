@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
         interruption.listening = False
         if not of_process and not interruption.number:
             interruption.stop()
-    statuses.append(interruption.status(status))
+    statuses.append(128 + interruption.number if interruption.number else status)
     sys.exit(*statuses)
 
 
@@ -123,7 +123,7 @@ def _status(name: str, arguments: list[str]) -> int:
 def _run(name: str, arguments: list[str]) -> int:
     """Run a command, or print the summary or the version; returns the exit status."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_summary())
+        print(_SUMMARY.format(commands="\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items())))
         return 0 if arguments else 2
     if arguments[0] == "--version":
         from importlib.metadata import version
@@ -230,7 +230,3 @@ def _expanded(argument: str) -> str:
     """The argument with the user's folder for ``~``, which a shell does not expand in quotes or after ``--option=``."""
     option, equals, value = argument.partition("=") if argument.startswith("--") else ("", "", argument)
     return f"{option}{equals}{os.path.expanduser(value)}"
-
-
-def _summary() -> str:
-    return _SUMMARY.format(commands="\n".join(f"  {name:<10} {summary}" for name, summary in COMMANDS.items()))
