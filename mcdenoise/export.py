@@ -206,13 +206,14 @@ def export_model(
     program = traced(step)
     inputs = (*step.given, *(f"state.{each}" for each in step.state))
     outputs = ("image", *(f"next_state.{each}" for each in step.state))
+    exported = Exported(path, inputs, outputs, len(program.graph.nodes))
     about = {"model": name or type(model).__name__, "mcdenoise": version("mcdenoise"), "torch": torch.__version__}
     with atomic_path(path) as temporary, _quiet():
         if path.suffix == ".onnx":
-            _write_onnx(program, temporary, inputs, outputs, about)
+            _write_onnx(program, temporary, exported, about)
         else:
             torch.export.save(program, temporary, extra_files=about)
-    return Exported(path, inputs, outputs, len(program.graph.nodes))
+    return exported
 
 
 def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterator[tuple[int, float]]:
@@ -276,17 +277,10 @@ def _check_no_history(
         )
 
 
-def _write_onnx(
-    program: torch.export.ExportedProgram,
-    path: Path,
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    about: dict[str, str],
-) -> None:
+def _write_onnx(program: torch.export.ExportedProgram, path: Path, exported: Exported, about: dict[str, str]) -> None:
+    names: dict[str, Any] = {"input_names": list(exported.inputs), "output_names": list(exported.outputs)}
     try:
-        written = torch.onnx.export(
-            program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
-        )
+        written = torch.onnx.export(program, dynamo=True, optimize=True, verbose=False, **names)
     except Exception as error:
         first: BaseException = error
         while first.__cause__ is not None:
@@ -344,18 +338,9 @@ def _free_axes(small: Tensor, large: Tensor) -> dict[int, Any]:
 
 def _names(paths: list[Any]) -> list[str | None]:
     """A readable name for each path: its field names, with indices only where needed for uniqueness."""
-    short = [None if path is None else ".".join(_part(key) for key in path if not _is_index(key)) for path in paths]
-    if len({name for name in short if name}) == sum(path is not None for path in paths):
-        return short
-    return [None if path is None else ".".join(_part(key) for key in path) or "all" for path in paths]
-
-
-def _is_index(key: Any) -> bool:
-    return isinstance(key, pytree.SequenceKey)
-
-
-def _part(key: Any) -> str:
-    for attribute in ("name", "key", "idx"):
-        if hasattr(key, attribute):
-            return str(getattr(key, attribute))
-    return str(key)
+    # A key prints as .name, ['key'] or [index].
+    parts = [[] if path is None else [(key, str(key).strip(".[]'")) for key in path] for path in paths]
+    short = [".".join(text for key, text in each if not isinstance(key, pytree.SequenceKey)) for each in parts]
+    if len(set(filter(None, short))) < sum(path is not None for path in paths):
+        short = [".".join(text for _, text in each) or "all" for each in parts]
+    return [None if path is None else name for path, name in zip(paths, short, strict=True)]
