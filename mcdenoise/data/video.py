@@ -108,6 +108,4 @@ def _size_in_video(picture: Picture) -> tuple[int, int]:
 
 def _even(picture: Picture) -> Picture:
     height, width, _ = picture.shape
-    if height % 2 == width % 2 == 0:
-        return np.ascontiguousarray(picture)
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), "edge")
