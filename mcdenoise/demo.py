@@ -6,7 +6,7 @@ import os
 import shlex
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,26 +41,6 @@ COMPARED = f"{PEER},joint_bilateral(sigma_color=0.2, sigma_space=4.0),svgf,wild_
 _CLOSE_UP = (0.42, 0.40, 0.25, 0.25)
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """The results of the demonstration.
-
-    Args:
-        results: errors and run times of several methods, over the frames with references.
-        report: run times by stage, and what was done.
-        picture: noisy, accumulated, by Open Image Denoise in its best setting where that is installed, denoised and
-            reference side by side, with close-ups.
-        denoised: folder of the clean EXRs.
-        page: the report of error against run time of several methods.
-    """
-
-    results: Results
-    report: SequenceReport
-    picture: Path
-    denoised: Path
-    page: Path
-
-
 def run_demo(
     out: Path,
     *,
@@ -68,17 +48,22 @@ def run_demo(
     on_render: Callable[[int, int], None] = lambda done, total: None,
     on_frame: Callable[[], None] = lambda: None,
     on_compare: Callable[[int, int], None] = lambda done, total: None,
-) -> DemoResult:
+) -> tuple[Results, SequenceReport]:
     """Render 10 frames at one sample a pixel, denoise them, and compare the last ones with references.
 
     Frames that an earlier run rendered into the same folder are used again; its report is replaced.
 
     Args:
-        out: folder to write to: ``sequence/``, ``denoised/``, ``demo.png`` and ``report/``.
+        out: folder to write to: ``sequence/``; ``denoised/``, the clean EXRs; ``demo.png``, the noisy frame,
+            accumulated, by Open Image Denoise in its best setting where that is installed, denoised, and the reference
+            side by side, with close-ups; and ``report/index.html``, error against run time of several methods.
         model: see :func:`mcdenoise.methods.parse_method`.
         on_render: called with finished and total paths a pixel.
         on_frame: called after each denoised frame.
         on_compare: called with finished and all steps of the comparison that is reported.
+
+    Returns:
+        Errors and run times of the methods over the frames with references; and the report of denoising.
 
     Raises:
         InputError: Mitsuba or a package of the report is missing, the model is unknown, or the folder cannot be
@@ -101,10 +86,11 @@ def run_demo(
     )
     sequence = open_sequence(out / "sequence")
     report = denoise_sequence(sequence, out / "denoised", denoiser, spelling.name, on_frame=on_frame)
-    folder, picture = out / "report", out / "demo.png"
+    folder = out / "report"
     results = _compare(out, folder, model, on_compare)
-    write_png(picture, _sheet(folder, results, spelling.name))
-    return DemoResult(results, report, picture, out / "denoised", write_report(folder))
+    write_png(out / "demo.png", _sheet(folder, results, spelling.name))
+    write_report(folder)
+    return results, report
 
 
 def _compare(out: Path, folder: Path, model: str, on_step: Callable[[int, int], None]) -> Results:

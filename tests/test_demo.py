@@ -21,36 +21,37 @@ def small_demo(monkeypatch):
 
 def test_demo_renders_denoises_and_shows(small_demo, tmp_path, monkeypatch):
     rendered, denoised = [], []
-    result = small_demo.run_demo(
+    results, _ = small_demo.run_demo(
         tmp_path,
         on_render=lambda done, total: rendered.append((done, total)),
         on_frame=lambda: denoised.append(len(denoised)),
     )
     assert rendered[-1][0] == rendered[-1][1] == 3 + 2 * 64
     assert denoised == [0, 1, 2]
-    smape = {cell.method: cell.errors["SMAPE"] for cell in result.results.cells if cell.errors}
+    smape = {cell.method: cell.errors["SMAPE"] for cell in results.cells if cell.errors}
     assert smape["wild"] < smape["accumulated"] < smape["noisy"]
-    names = sorted(path.name for path in result.denoised.iterdir())
+    clean = tmp_path / "denoised"
+    names = sorted(path.name for path in clean.iterdir())
     assert names == ["denoise.json", "denoised0.exr", "denoised1.exr", "denoised2.exr"]
-    assert result.page == tmp_path / "report" / "index.html"
+    page = tmp_path / "report" / "index.html"
     found = Results.read(tmp_path / "report")
-    assert found == result.results
+    assert found == results
     assert (found.scenes[0].scored, found.scenes[0].pictures, found.failed) == ([1, 2], [0, 1, 2], False)
     assert "demo" in found.command
     # The errors are those of the files that were written, up to their half precision.
-    written = evaluate_folder(open_sequence(tmp_path / "sequence"), result.denoised).tables["strict"]
+    written = evaluate_folder(open_sequence(tmp_path / "sequence"), clean).tables["strict"]
     assert smape["wild"] == pytest.approx(written.mean["SMAPE"], rel=1e-3)
-    sheet = result.picture.read_bytes()
+    sheet = (tmp_path / "demo.png").read_bytes()
     assert sheet.startswith(b"\x89PNG")
 
     # Existing files are used again: the noise, and with it every clean frame, stays the same to the last bit.
-    before = read_exr(result.denoised / "denoised2.exr")[0]
+    before = read_exr(clean / "denoised2.exr")[0]
     files = {path: path.stat().st_mtime_ns for path in (tmp_path / "sequence" / "inputs").glob("*.exr")}
     assert len(files) == 3 * 5 + 2
-    report = result.page.stat().st_mtime_ns
+    report = page.stat().st_mtime_ns
     monkeypatch.setattr(small_demo, "COMPARED", "none")
-    again = small_demo.run_demo(tmp_path)
-    assert again.page.stat().st_mtime_ns > report
+    small_demo.run_demo(tmp_path)
+    assert page.stat().st_mtime_ns > report
     assert {path: path.stat().st_mtime_ns for path in files} == files
-    np.testing.assert_array_equal(read_exr(again.denoised / "denoised2.exr")[0], before)
+    np.testing.assert_array_equal(read_exr(clean / "denoised2.exr")[0], before)
     assert open_sequence(tmp_path / "sequence").reference_numbers == [1, 2]

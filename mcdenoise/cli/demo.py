@@ -26,14 +26,14 @@ def demo(out: Out = Path("demo"), model: str = DEFAULT) -> None:
         rendering = progress.add_task("render", total=None)
         denoising = progress.add_task("denoise", total=FRAMES)
         comparing = progress.add_task("compare", total=None)
-        result = run_demo(
+        results, report = run_demo(
             out,
             model=model,
             on_render=lambda done, total: progress.update(rendering, completed=done, total=total),
             on_frame=lambda: progress.advance(denoising),
             on_compare=lambda done, total: progress.update(comparing, completed=done, total=total),
         )
-    print_rows(scene_rows(result.results))
-    print_times(result.report.milliseconds)
-    for what, path in {"clean frames": result.denoised, "picture": result.picture, "report": result.page}.items():
-        say(f"{what}: {path}")
+    print_rows(scene_rows(results))
+    print_times(report.milliseconds)
+    for what, path in {"clean frames": "denoised", "picture": "demo.png", "report": "report/index.html"}.items():
+        say(f"{what}: {out / path}")
