@@ -130,9 +130,7 @@ def write_frames(
             written.
         InputError: a file cannot be written, or memory is insufficient.
     """
-    write = partial(
-        _write, sequence, out, report, unwritten, output_layer=output_layer, full_float=full_float, on_file=on_file
-    )
+    save = partial(sequence.write, out, output_layer=output_layer, full_float=full_float)
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] = writer.submit(lambda: None)
         seen: Tensor | None = None
@@ -145,7 +143,8 @@ def write_frames(
             start = time.perf_counter()
             writing.result()
             report.frames[number] = denoiser.report
-            writing = writer.submit(write, number, output, denoiser.report)
+            kept = None if number in unwritten else save
+            writing = writer.submit(_write, number, output, report, denoiser.report, kept, on_file)
             del output
             if not denoiser.has_room_ahead:
                 writing.result()
@@ -155,29 +154,18 @@ def write_frames(
 
 
 def _write(
-    sequence: Sequence,
-    out: Path,
-    report: SequenceReport,
-    unwritten: Collection[int],
     number: int,
     output: Output,
+    report: SequenceReport,
     done: FrameReport,
-    *,
-    output_layer: str | None,
-    full_float: bool,
+    save: Callable[..., Path] | None,
     on_file: Callable[[int, Tensor], None] | None,
 ) -> None:
     start = time.perf_counter()
-    if number not in unwritten:
-        report.files[number] = sequence.write(
-            out,
-            number,
-            _pixels(output.image),
-            alpha=None if output.alpha is None else _pixels(output.alpha),
-            lights={name: _pixels(layer) for name, layer in output.layers.items()},
-            output_layer=output_layer,
-            full_float=full_float,
-        )
+    if save is not None:
+        alpha = None if output.alpha is None else _pixels(output.alpha)
+        lights = {name: _pixels(layer) for name, layer in output.layers.items()}
+        report.files[number] = save(number, _pixels(output.image), alpha=alpha, lights=lights)
         done.beside["write"] = _since(start)
     if on_file is not None:
         start = time.perf_counter()
