@@ -18,7 +18,7 @@ from mcdenoise.data.readers.names import group_files
 from mcdenoise.data.readers.opening import Result, open_result
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.errors import InputError, naming
-from mcdenoise.evaluate.noise import as_noisy, mean_noise, recorded_noise
+from mcdenoise.evaluate.noise import as_noisy, recorded_noise, reference_noise
 from mcdenoise.evaluate.scores import METRICS, USUAL, Scores, check_references
 from mcdenoise.folder import denoised_frames
 from mcdenoise.frame import Frame
@@ -246,7 +246,7 @@ def _evaluate(
             reason = "no two successive frames with references"
         missing = {metric: reason for metric in names if metric not in table.counts}
         table.skipped = {**missing, **table.skipped, **PROTOCOLS[name].missing}
-    return Evaluation(sequence.name, source, tables, pairs.warping_error, mean_noise(noise), floor.mean)
+    return Evaluation(sequence.name, source, tables, pairs.warping_error, reference_noise(sequence), floor.mean)
 
 
 def _metrics(protocol: ProtocolName) -> Mapping[str, Metric]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -18,12 +17,8 @@ _NOISE_EPSILON = 0.01
 
 def reference_noise(sequence: Sequence) -> float | None:
     """Mean noise of the references, as recorded by the renderer, see :func:`recorded_noise`; ``None`` if it is not."""
-    return mean_noise(recorded_noise(sequence))
-
-
-def mean_noise(noise: Mapping[int, float]) -> float | None:
-    """The mean over the frames, ``None`` for none."""
-    return sum(noise.values()) / len(noise) if noise else None
+    noise = recorded_noise(sequence).values()
+    return sum(noise) / len(noise) if noise else None
 
 
 def as_noisy(truth: Tensor, smape: float, seed: int) -> Tensor:
