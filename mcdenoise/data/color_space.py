@@ -50,6 +50,8 @@ def to_rec709(image: Tensor, metadata: Metadata) -> Tensor:
 
 def _matrix(points: np.ndarray[Any, Any]) -> Tensor | None:
     """``(3, 3)`` matrix from RGB to Rec. 709; ``None`` if the primaries are collinear."""
+    if abs(np.linalg.det(points[1:3] - points[0])) < _CLOSE:
+        return None
     colour = import_colour()
     target = colour.RGB_COLOURSPACES["ITU-R BT.709"]
     try:

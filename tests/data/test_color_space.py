@@ -33,7 +33,12 @@ def test_acescg_is_converted() -> None:
     torch.testing.assert_close(to_rec709(white, {"chromaticities": ACESCG}), white, atol=1e-4, rtol=0)
 
 
-@pytest.mark.parametrize("stored", ["wide", (0.64, 0.33), (0.3,) * 8, (0.0,) * 8, (float("nan"),) * 8], ids=str)
+RED_IS_GREEN = (0.64, 0.33, 0.64, 0.33, 0.15, 0.06, 0.3127, 0.329)
+
+
+@pytest.mark.parametrize(
+    "stored", ["wide", (0.64, 0.33), (0.3,) * 8, (0.0,) * 8, (float("nan"),) * 8, RED_IS_GREEN], ids=str
+)
 def test_invalid_color_spaces(stored: Any) -> None:
     assert "'chromaticities':" in refused(to_rec709, torch.rand(1, 3, 2, 2), {"chromaticities": stored})
 
