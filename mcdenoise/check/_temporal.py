@@ -319,7 +319,7 @@ _COLOR = Argument(_DRAWN, 3)
 STEPS = (
     _step(
         history.incoming,
-        {"color": Argument(sparks(_DRAWN, 400, (0, 0)), 3), "albedo": Argument(between(0.1, 0.9), 3)},
+        {"color": Argument(sparks(_DRAWN, 400, (0, 0)), 3)},
         least_dtype=torch.float32,
     ),
     _step(history.lights, {"root": Argument(_bright_corner, 1)}),

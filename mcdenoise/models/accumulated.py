@@ -237,7 +237,7 @@ class Accumulated(Wrapper):
         limit = self._chosen(frame.color) if history is None else history.limit
         if blind and history is not None:
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
-        entering = incoming(frame.color, None, limit, compared=compared)
+        entering = incoming(frame.color, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
         if history is None:
             return self._begun(frame, entering, limit, seen, reset)
@@ -248,7 +248,7 @@ class Accumulated(Wrapper):
             # The light of a new shot may differ, and the cut is found only here.
             chosen = torch.where(cut, self._chosen(frame.color), limit)
             if not torch.equal(chosen, limit):
-                limit, entering = chosen, incoming(frame.color, None, chosen, compared=compared)
+                limit, entering = chosen, incoming(frame.color, chosen, compared=compared)
             if cut.all():
                 return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)

@@ -182,30 +182,22 @@ def reproject(
 
 
 def check_accumulate(
-    color: Tensor,
-    previous: Tensor,
-    previous_length: Tensor,
-    motion: Tensor | None,
-    surface: Surface | None = None,
-    previous_surface: Surface | None = None,
-    *,
-    alpha_min: float = 0.1,
-    position_limit: float | None = None,
-    normal_limit: float | None = None,
+    previous: Tensor, surface: Surface | None, previous_surface: Surface | None, alpha_min: float
 ) -> None:
-    """``TypeError`` or ``ValueError`` for arguments that :func:`accumulate` refuses."""
-    check_shapes(
-        color=(color, "B C H W"),
-        previous=(previous, "B C H W"),
-        previous_length=(previous_length, "B 1 H W"),
-        motion=(motion, "[B 2 H W]"),
-    )
+    """``TypeError`` or ``ValueError`` for arguments, besides shapes of images, that :func:`accumulate` refuses."""
     if not 0 < alpha_min <= 1:
         raise ValueError(f"alpha_min: expected in (0, 1], found {alpha_min}")
     check_surfaces(previous, surface, previous_surface)
 
 
-@op("numba", check=check_accumulate)
+@op(
+    "numba",
+    check=check_accumulate,
+    color="B C H W",
+    previous="B C H W",
+    previous_length="B 1 H W",
+    motion="[B 2 H W]",
+)
 def accumulate(
     color: Tensor,
     previous: Tensor,

@@ -86,7 +86,6 @@ def passed(
     *,
     alpha_min: float = 0.1,
     limit: float = 15.0,
-    window: int = 7,
     specular_length: float = 2,
     lag_threshold: float = 2.0,
     still: bool = False,
@@ -99,7 +98,7 @@ def passed(
         # The camera looks along z.
         depth = position[:, 2:] if frame.depth is None and position is not None else frame.depth
         with use(backend):
-            entering = steps.incoming(frame.color, frame.albedo, limit, window, compared=tests)
+            entering = steps.incoming(frame.color, limit, compared=tests)
             seen = steps.lights(entering[:, steps.MEAN]) if tests else None
             if number == 0:
                 history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])

@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from oracles import edges, history, resolutions
+from oracles import edges, history
 
 
-def incoming(color: Tensor, albedo: Tensor) -> Tensor:
-    clamped = edges.clamp_fireflies(resolutions.demodulate(color, albedo))
+def incoming(color: Tensor) -> Tensor:
+    clamped = edges.clamp_fireflies(color)
     mean = clamped.mean(1, keepdim=True)
     return torch.cat([clamped, mean**0.25, mean**0.5], 1)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from mcdenoise.ops._constants import (
     BRIGHTER,
     EVEN,
+    FIREFLY_WINDOW,
     LAG_WINDOW,
     LIGHT_WINDOW,
     RECENT_ALPHA,
@@ -24,17 +25,15 @@ from mcdenoise.ops._constants import (
 )
 from mcdenoise.ops._history import Blended, root_changes
 from mcdenoise.ops._numba._runtime import add, compiled, copy_row, read_row, share_rows, source
-from mcdenoise.ops._numba.temporal import Shorter, between, blended
+from mcdenoise.ops._numba.temporal import between, blended
 from mcdenoise.ops._surface import Surface
 from mcdenoise.ops._window import parts_of
 
 _RADIUS = LAG_WINDOW // 2
 
 
-def incoming(color: Tensor, albedo: Tensor | None, limit: float | Tensor, kernel_size: int, compared: bool) -> Any:
+def incoming(color: Tensor, limit: float | Tensor, compared: bool) -> Tensor:
     """See :func:`mcdenoise.ops._steps.history.incoming`."""
-    if albedo is not None:
-        return NotImplemented
     dtype = torch.promote_types(color.dtype, torch.float32)
     batch, channels, height, width = color.shape
     result = torch.empty((batch, channels + 2 * compared, height, width), dtype=dtype, device="cpu")
@@ -42,8 +41,8 @@ def incoming(color: Tensor, albedo: Tensor | None, limit: float | Tensor, kernel
         limits = limit.flatten() if isinstance(limit, Tensor) else result.new_full((batch,), limit)
         out, image = result.numpy(), source(color.to(dtype))
         # A power of two, which rounds nothing: no sum of a window overflows.
-        scale = result.new_tensor(2.0 ** -(channels * kernel_size**2).bit_length()).numpy()[()]
-        sums, radius = result.new_empty((batch, 5, height, width)).numpy(), kernel_size // 2
+        scale = result.new_tensor(2.0 ** -(channels * FIREFLY_WINDOW**2).bit_length()).numpy()[()]
+        sums, radius = result.new_empty((batch, 5, height, width)).numpy(), FIREFLY_WINDOW // 2
         share_rows(color, lambda *rows: _sum_rows(sums, image, scale, radius, *rows), light=True)
         arguments = (out, image, sums, limits.detach().to(dtype).numpy(), radius)
         share_rows(color, lambda *rows: _clamp(*arguments, *rows), light=True)
@@ -181,7 +180,9 @@ def blend(
     recent_alpha = max(alpha_min, RECENT_ALPHA)
     color, length, counts = blended(
         *(entering, previous, previous_length, motion, surface, previous_surface, alpha_min),
-        shorter=Shorter(recent_alpha, albedo, specular_length + 1),
+        recent_alpha=recent_alpha,
+        albedo=albedo,
+        longest=specular_length + 1,
     )
     if not math.isinf(lag_threshold):
         _discard_lag(color, length, entering, lag_threshold, recent_alpha)

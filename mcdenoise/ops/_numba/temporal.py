@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,20 +20,6 @@ from mcdenoise.ops._surface import Surface, comparable
 
 # Pixels of a run.
 _RUN = 128
-
-
-class Shorter(NamedTuple):
-    """The settings that shorten histories, see :func:`mcdenoise.ops._steps.history.blend`.
-
-    Args:
-        recent_alpha: smallest weight of the current frame in a second, shorter history of the first channels.
-        albedo: ``(B, 3, H, W)``, which says where a mirror or glass is seen.
-        longest: the longest history of mirrors and glass while the image moves, in frames.
-    """
-
-    recent_alpha: float = 1.0
-    albedo: Tensor | None = None
-    longest: float = math.inf
 
 
 def reproject(
@@ -72,11 +58,15 @@ def blended(
     alpha_min: float,
     position_limit: float | None = None,
     normal_limit: float | None = None,
-    shorter: Shorter = Shorter(),  # noqa: B008
+    recent_alpha: float = 1.0,
+    albedo: Tensor | None = None,
+    longest: float = math.inf,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As ``accumulate``, with a history that is shorter in places or channels; and how many pixels of a row have one.
 
-    Channels that ``previous`` has more than ``color`` are the second history of the first of them.
+    Channels that ``previous`` has more than ``color`` are the second, shorter history of the first of them, in which
+    the frame has a weight of at least ``recent_alpha``. Where the albedo shows mirrors or glass and the image moves, no
+    history is longer than ``longest``.
     """
     dtype = torch.promote_types(color.dtype, torch.float32)
     batch, _, height, _ = previous.shape
@@ -85,9 +75,9 @@ def blended(
     kept = torch.zeros(batch, height, dtype=torch.int64, device="cpu")
     if result.numel():
         taps = _taps(dtype, motion, surface, previous_surface, position_limit, normal_limit)
-        images = (_planes(image, dtype) for image in (previous, previous_length, color, shorter.albedo))
+        images = (_planes(image, dtype) for image in (previous, previous_length, color, albedo))
         # In the dtype of the sums: a number in double precision would make the sums so.
-        settings = result.new_tensor([alpha_min, shorter.recent_alpha, shorter.longest, NO_ALBEDO, STILL**2]).numpy()
+        settings = result.new_tensor([alpha_min, recent_alpha, longest, NO_ALBEDO, STILL**2]).numpy()
         arguments = (result.numpy(), length.numpy(), kept.numpy(), *images, settings, *taps)
         share_rows(previous, lambda *rows: _blend(*arguments, *rows))
     return result.to(color.dtype), length.to(previous_length.dtype), kept

@@ -22,8 +22,7 @@ from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Ble
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._surface import Surface
 from mcdenoise.ops._window import corner
-from mcdenoise.ops.demodulation import demodulate
-from mcdenoise.ops.fireflies import KERNEL_SIZE, LIMIT, clamp_fireflies
+from mcdenoise.ops.fireflies import LIMIT, clamp_fireflies
 from mcdenoise.ops.lag import history_lag
 from mcdenoise.ops.temporal import accumulate, check_accumulate
 
@@ -41,57 +40,34 @@ __all__ = [
 ]
 
 
-def _check_incoming(
-    color: Tensor,
-    albedo: Tensor | None = None,
-    limit: float | Tensor = LIMIT,
-    kernel_size: int = KERNEL_SIZE,
-    *,
-    compared: bool = True,
-) -> None:
-    images = {"color": (color, "B 3 H W")} | ({} if albedo is None else {"albedo": (albedo, "B 3 H W")})
-    check_shapes(**images, **({"limit": (limit, "B 1 1 1")} if isinstance(limit, Tensor) else {}))
+def _check_incoming(color: Tensor, limit: float | Tensor) -> None:
+    check_shapes(color=(color, "B 3 H W"), limit=(limit if isinstance(limit, Tensor) else None, "[B 1 1 1]"))
 
 
 @op("numba", check=_check_incoming)
-def incoming(
-    color: Tensor,
-    albedo: Tensor | None = None,
-    limit: float | Tensor = LIMIT,
-    kernel_size: int = KERNEL_SIZE,
-    *,
-    compared: bool = True,
-) -> Tensor:
-    """A frame as it enters a history: without albedo and fireflies.
+def incoming(color: Tensor, limit: float | Tensor = LIMIT, *, compared: bool = True) -> Tensor:
+    """A frame as it enters a history: without fireflies.
 
-    ``clamp_fireflies(demodulate(color, albedo))``, and for the test for lag the fourth root ``r`` of the mean over its
-    channels, in which a firefly hides little, and ``r^2``. Any power keeps the ratio of a difference to its noise at
-    any exposure; a logarithm would need a unit.
+    ``clamp_fireflies(color)``, and for the test for lag the fourth root ``r`` of the mean over its channels, in which a
+    firefly hides little, and ``r^2``. Any power keeps the ratio of a difference to its noise at any exposure; a
+    logarithm would need a unit.
 
     Args:
         color: ``(B, 3, H, W)`` radiance, finite and non-negative.
-        albedo: ``(B, 3, H, W)`` to divide by, see :func:`mcdenoise.ops.demodulate`; nothing is divided by default.
         limit: see :func:`mcdenoise.ops.clamp_fireflies`; a number, or ``(B, 1, 1, 1)`` of each image.
-        kernel_size: see :func:`mcdenoise.ops.clamp_fireflies`.
         compared: whether the two channels for the test for lag are wanted; they have no derivative.
 
     Returns:
         ``(B, 5, H, W)``, or ``(B, 3, H, W)`` without the two; at least float32, in which half precision is computed.
     """
-    color = color.to(torch.promote_types(color.dtype, torch.float32))
-    color = color if albedo is None else demodulate(color, albedo)
-    color = clamp_fireflies(color, limit=limit, kernel_size=kernel_size)
+    color = clamp_fireflies(color.to(torch.promote_types(color.dtype, torch.float32)), limit=limit)
     if not compared:
         return color
     root = color.detach().mean(1, keepdim=True).clamp_min(0).sqrt().sqrt()
     return torch.cat([color, root, root.square()], 1)
 
 
-def _check_lights(root: Tensor) -> None:
-    check_shapes(root=(root, "B 1 H W"))
-
-
-@op("numba", check=_check_lights)
+@op("numba", root="B 1 H W")
 def lights(root: Tensor) -> Tensor:
     """Find the lights in one frame: blocks of 3x3 pixels that are alike and brighter than the window around them.
 
@@ -129,31 +105,27 @@ def without_history(entering: Tensor) -> Tensor:
 def _check_blend(
     entering: Tensor,
     previous: Tensor,
-    previous_length: Tensor,
-    motion: Tensor | None,
-    surface: Surface | None = None,
-    previous_surface: Surface | None = None,
-    *,
-    alpha_min: float = 0.1,
-    albedo: Tensor | None = None,
-    specular_length: float = math.inf,
-    lag_threshold: float = math.inf,
+    surface: Surface | None,
+    previous_surface: Surface | None,
+    alpha_min: float,
+    specular_length: float,
+    lag_threshold: float,
 ) -> None:
     if not specular_length >= 0:
         raise ValueError(f"specular_length: expected at least 0, found {specular_length}")
     channels = ("C", "C") if math.isinf(lag_threshold) else (str(SQUARE.stop), str(RECENT.stop))
-    check_shapes(
-        entering=(entering, f"B {channels[0]} H W"),
-        previous=(previous, f"B {channels[1]} H W"),
-        **({} if albedo is None else {"albedo": (albedo, "B 3 H W")}),
-    )
-    check_accumulate(
-        *(previous, previous, previous_length, motion, surface, previous_surface),
-        alpha_min=alpha_min,
-    )
+    check_shapes(entering=(entering, f"B {channels[0]} H W"), previous=(previous, f"B {channels[1]} H W"))
+    check_accumulate(previous, surface, previous_surface, alpha_min)
 
 
-@op("numba", check=_check_blend)
+@op(
+    "numba",
+    check=_check_blend,
+    previous="B C H W",
+    previous_length="B 1 H W",
+    motion="[B 2 H W]",
+    albedo="[B 3 H W]",
+)
 def blend(
     entering: Tensor,
     previous: Tensor,
