@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock
-from mcdenoise.ops._window import corner, parts_of
+from mcdenoise.ops._window import corner, parts_of, up_to_multiple
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
 # stay float32.
@@ -88,15 +88,7 @@ class UNet(nn.Module):
         """
         height, width = x.shape[-2:]
         # Sizes are rounded up to multiples, so that halves are simple expressions in a graph for any image size.
-        features = self._features(_padded(x, self.multiple))
-        found = []
-        for scale in range(self.scales):
-            side = 1 << scale
-            found.append(corner(features[scale], parts_of(height, side), parts_of(width, side)))
-        return found
-
-    def _features(self, x: Tensor) -> list[Tensor]:
-        """Features of each level, finest first."""
+        x = up_to_multiple(x, self.multiple, "replicate")
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
@@ -107,21 +99,8 @@ class UNet(nn.Module):
         for up, block in zip(self.up, self.decoder, strict=True):
             x = block(torch.cat([up(x), skips.pop()], 1))
             features.append(x)
-        return features[::-1]
-
-
-def _padded(x: Tensor, multiple: int) -> Tensor:
-    """Repeat the last row and column of ``x`` up to multiples of ``multiple``."""
-    below, right = (parts_of(side, multiple) * multiple - side for side in x.shape[-2:])
-    # A graph for any image size cannot branch on whether padding is needed.
-    if torch.compiler.is_compiling():
-        return F.pad(x, (0, right, 0, below), mode="replicate")
-    # torch's padding takes several times as long, and computes in float32 under autocast.
-    for dim, missing in ((-2, below), (-1, right)):
-        if missing:
-            edge = x.narrow(dim, -1, 1)
-            x = torch.cat([x, *[edge] * missing], dim)
-    return x
+        scales = enumerate(features[: -self.scales - 1 : -1])
+        return [corner(each, parts_of(height, 1 << scale), parts_of(width, 1 << scale)) for scale, each in scales]
 
 
 def _block(in_channels: int, out_channels: int) -> nn.Sequential:

@@ -26,12 +26,6 @@ _FEW_PIXELS = 8192
 _used: ContextVar[tuple[Backend, bool] | None] = ContextVar("mcdenoise.ops.use", default=None)
 
 
-def check_backend(backend: str | None) -> None:
-    """``ValueError`` for an unknown backend."""
-    if backend is not None and backend not in BACKENDS:
-        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
-
-
 def choose_backend(backends: Sequence[Backend], tensors: Sequence[Tensor]) -> Backend:
     """The backend to run an op on ``tensors`` with: the fastest that can run and pays, or the one of :func:`use`.
 
@@ -68,7 +62,8 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
         >>> with ops.use("torch"):
         ...     half = ops.downsample(torch.ones(1, 3, 4, 4))
     """
-    check_backend(backend)
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: expected one of {', '.join(BACKENDS)}, found {backend!r}")
     token = _used.set((backend, strict))
     try:
         yield

@@ -17,11 +17,12 @@ import functools
 import importlib
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from mcdenoise.ops._backend import Backend, choose_backend
 from mcdenoise.ops._check import check_shapes
@@ -63,7 +64,7 @@ def op(
             # The compiler traces no choice; its graph is that of the plain implementation.
             if torch.compiler.is_compiling():
                 return plain(*arguments, **settings)
-            tensors = list(_tensors((*arguments, *settings.values())))
+            tensors = [each for each in pytree.tree_leaves(given) if isinstance(each, Tensor)]
             if choose_backend(backends, tensors) == "numba":
                 result = fast_form(page, plain.__name__)(*[given[name] for name in names])
                 if result is not NotImplemented:
@@ -99,14 +100,6 @@ def backends_of(function: Callable[..., Any]) -> tuple[Backend, ...]:
     """Names of the backends of an op, with plain torch."""
     found: tuple[Backend, ...] = getattr(function, "backends", ("torch",))
     return found
-
-
-def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
-    for value in values:
-        if isinstance(value, Tensor):
-            yield value
-        elif isinstance(value, (list, tuple)):
-            yield from _tensors(value)
 
 
 @functools.cache

@@ -139,21 +139,11 @@ def _affine(
 ) -> Tensor:
     """``sum_q exp(-a[p] |f[p] - g[q]|^2) v[q]``."""
     radius = kernel_size // 2 * dilation
-    padded, padded_values = pad(there, radius, "zeros"), pad(values, radius, "zeros")
+    padded = [pad(each, radius, "zeros") for each in (there, values)]
     total = torch.zeros_like(values)
-    for dy, dx in taps_of(kernel_size, dilation, skip_center):
-        distance = squared_distance(here, tap_of(padded, here, dy, dx), FARTHEST_FEATURE)
-        total = total + torch.exp(-bandwidth * distance) * tap_of(padded_values, here, dy, dx)
+    for _, dy, dx in offsets(kernel_size):
+        if skip_center and dy == dx == 0:
+            continue
+        tap, value = (shifted(each, radius, dy * dilation, dx * dilation, *here.shape[-2:]) for each in padded)
+        total = total + torch.exp(-bandwidth * squared_distance(here, tap, FARTHEST_FEATURE)) * value
     return total
-
-
-def taps_of(kernel_size: int, dilation: int, skip_center: bool) -> list[tuple[int, int]]:
-    """Row and column offset of each tap in pixels."""
-    every = [(dy * dilation, dx * dilation) for _, dy, dx in offsets(kernel_size)]
-    return [at for at in every if at != (0, 0)] if skip_center else every
-
-
-def tap_of(padded: Tensor, image: Tensor, dy: int, dx: int) -> Tensor:
-    """The view of ``padded`` in which each pixel of ``image`` shows the tap at that offset."""
-    height, width = image.shape[-2:]
-    return shifted(padded, (padded.shape[-2] - height) // 2, dy, dx, height, width)

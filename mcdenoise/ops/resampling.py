@@ -11,8 +11,6 @@ from mcdenoise.ops._constants import CUBIC
 from mcdenoise.ops._op import op
 from mcdenoise.ops.temporal import places_before
 
-__all__ = ["resample"]
-
 
 @op("numba", previous="B C H W", motion="B 2 H W")
 def resample(previous: Tensor, motion: Tensor) -> Tensor:

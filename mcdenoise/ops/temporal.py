@@ -12,15 +12,6 @@ from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
 from mcdenoise.ops._surface import Surface, check_surfaces, comparable
 
-__all__ = [
-    "Accumulate",
-    "Surface",
-    "accumulate",
-    "check_accumulate",
-    "motion_from_position",
-    "reproject",
-]
-
 
 def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> Tensor:
     """The motion of each point of a static surface: its place in the previous frame minus its place now.
