@@ -77,7 +77,7 @@ def _bilateral_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[
         squares = [dy * dy + dx * dx for _, dy, dx in offsets(size)]
         terms = terms + distance * torch.tensor(squares, dtype=own.dtype)[:, None, None]
     # Those outside have no weight.
-    there = inside(own.shape[2], own.shape[3], size, own.device) | (border != "renormalize")
+    there = inside(own, size) | (border != "renormalize")
     terms = torch.where(there, terms, 0)
     return {"kernel": own * (1 + terms) if settings.get("normalize") == "none" else own + terms}
 

@@ -12,7 +12,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models._fireflies import light_of
 from mcdenoise.models._reads import at_hand
 from mcdenoise.ops import NO_ALBEDO
-from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops._window import of_blocks, up_to_multiple
 
 # Relative difference of two pixels. Consecutive samples of a path tracer differ by ten times as much or more.
 _SMOOTH = 0.02
@@ -61,8 +61,10 @@ def noise_free(frame: Frame) -> Tensor | None:
     lowest = plainly * ((1 + _SMOOTH / 2) / (1 - _SMOOTH / 2))
     rough = torch.zeros_like(plain)
     for dim in (-2, -1):
-        (here, there), (here_lowest, there_lowest) = (_neighbours(image, dim) for image in (plainly, lowest))
-        rough.narrow(dim, 0, here.shape[dim]).logical_or_((here > there_lowest) | (there > here_lowest))
+        count = plain.shape[dim] - 1
+        here, here_lowest = (image.narrow(dim, 0, count) for image in (plainly, lowest))
+        there, there_lowest = (image.narrow(dim, 1, count) for image in (plainly, lowest))
+        rough.narrow(dim, 0, count).logical_or_((here > there_lowest) | (there > here_lowest))
     # One sum for both tests: a single difference outweighs all votes.
     counted = plain.to(brightness.dtype).add_(rough, alpha=_MANY)
     sums = F.avg_pool2d(up_to_multiple(counted, _CELL), _CELL)
@@ -70,13 +72,6 @@ def noise_free(frame: Frame) -> Tensor | None:
     cells = (witnesses >= _LEAST_WITNESSES) & (witnesses < _MANY)
     if looks and not cells.any():
         return None
-    wide = cells.repeat_interleave(_CELL, -2).repeat_interleave(_CELL, -1)
     found = torch.zeros_like(known)
-    found[..., band, :] = plain & corner(wide, plain.shape[-2], plain.shape[-1])
+    found[..., band, :] = plain & of_blocks(cells, _CELL, *plain.shape[-2:])
     return found
-
-
-def _neighbours(image: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """The pixels that have a next pixel along an axis, and those next pixels."""
-    count = image.shape[dim] - 1
-    return image.narrow(dim, 0, count), image.narrow(dim, 1, count)

@@ -17,7 +17,7 @@ from mcdenoise.models._noise_free import noise_free
 from mcdenoise.models._state import own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import TILE
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import block_means, of_blocks
 
 # So small that no error metric changes in its third digit.
 TOLERANCE = 1e-3
@@ -100,8 +100,8 @@ class Skipping(Wrapper):
         carries = bool(frame.layers) or alpha_of(frame) is not None
         free = noise_free(frame)
         kept = self._decided(frame, current, before) if still and not carries else None
-        passed = None if kept is None else _pixels(kept.passed, frame.size)
-        reused = None if kept is None else _pixels(kept.reused, frame.size)
+        passed = None if kept is None else of_blocks(kept.passed, TILE, *frame.size)
+        reused = None if kept is None else of_blocks(kept.reused, TILE, *frame.size)
         none = "layers or alpha are asked for" if still and carries else "there are none"
         result = None if before is None else before.image
         skip = _skip(free, passed, reused, current, frame.color, result)
@@ -129,7 +129,7 @@ class Skipping(Wrapper):
             return Remembered(None, frame.color, weight, passed, torch.zeros_like(passed), None)
         reused, marks = self._unchanged(frame, weight, before)
         reused = reused & ~passed
-        pixels = _pixels(reused, frame.size)
+        pixels = of_blocks(reused, TILE, *frame.size)
         color, weight = torch.where(pixels, before.color, frame.color), torch.where(pixels, before.weight, weight)
         return Remembered(None, color, weight, passed, reused, marks)
 
@@ -144,8 +144,8 @@ class Skipping(Wrapper):
         factor = self._squared_weights(length) / ((1 - alpha).square() * (1 + self._squared_weights(length - 1)))
         factor = torch.where(length >= _LEAST_LENGTH, factor, torch.inf)
         squares = (current - color).square().mean(1, keepdim=True)
-        variance, residual = (_means(image, TILE // _STRIDE) for image in (squares * factor, squares))
-        mean = _means(color.mean(1, keepdim=True), TILE // _STRIDE)
+        variance, residual = (block_means(image, TILE // _STRIDE) for image in (squares * factor, squares))
+        mean = block_means(color.mean(1, keepdim=True), TILE // _STRIDE)
         # If the difference is zero, the pixel has no noise, or the renderer repeats its image: the noise is unknown. A
         # black pixel may still receive light later.
         noise = torch.where(residual.sqrt() > _LEAST_RESIDUAL * mean, variance.sqrt() / mean, torch.inf)
@@ -204,25 +204,16 @@ def _note(name: str, pixels: Tensor | None, reason: str, none: str = "there are 
 
 def _change(color: Tensor, weight: Tensor, old_color: Tensor, old_weight: Tensor, tile: int) -> Tensor:
     """Change of each tile, relative to its mean."""
-    squares = _means((color - old_color).square().mean(1, keepdim=True), tile)
-    change = torch.where(squares > 0, squares.sqrt() / _means(color.mean(1, keepdim=True), tile), 0)
-    return (change + _EFFECT_OF_WEIGHT * _means((weight - old_weight).abs(), tile)).amax(0, keepdim=True)
+    squares = block_means((color - old_color).square().mean(1, keepdim=True), tile)
+    change = torch.where(squares > 0, squares.sqrt() / block_means(color.mean(1, keepdim=True), tile), 0)
+    return (change + _EFFECT_OF_WEIGHT * block_means((weight - old_weight).abs(), tile)).amax(0, keepdim=True)
 
 
 def _thinned(image: Tensor) -> Tensor:
     return image[..., ::_STRIDE, ::_STRIDE]
 
 
-def _means(image: Tensor, tile: int) -> Tensor:
-    return F.avg_pool2d(image, tile, ceil_mode=True, count_include_pad=False)
-
-
 def _marks(frame: Frame) -> Tensor:
     features = [frame.albedo, frame.normal, frame.depth]
     images = [torch.where(image.isfinite(), image, 0) for image in features if image is not None]
-    return _means(torch.cat(images, 1), TILE) if images else torch.zeros_like(frame.color[:, :1, :1, :1])
-
-
-def _pixels(tiles: Tensor, size: tuple[int, int]) -> Tensor:
-    wide = tiles.repeat_interleave(TILE, -2).repeat_interleave(TILE, -1)
-    return corner(wide, *size)
+    return block_means(torch.cat(images, 1), TILE) if images else torch.zeros_like(frame.color[:, :1, :1, :1])

@@ -7,7 +7,6 @@ are learnt; a network trained for this task on some hundred clips trusted the pr
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 
@@ -26,8 +25,6 @@ from mcdenoise.ops._window import accumulator_dtype
 # Sides of the windows over which the previous result is compared with this frame, and how much a difference equal to
 # the deviation of single samples reduces the logarithm of its weight.
 _WINDOWS, _DOUBTS = (3, 15), (2.0, 6.0)
-# Factors of a 15x15 sum: over 3 pixels, and then over 5 such sums that are 3 pixels apart.
-_SUMS = {3: ((3, 1),), 15: ((3, 1), (5, 3))}
 _LEAST_NOISE = 0.02  # smallest deviation of single samples, relative to their mean
 _LEAST_MEAN = 0.01  # smallest mean for relative differences; the typical radiance of the image is 0.18
 
@@ -98,9 +95,5 @@ def _relative(
 
 def _means(image: Tensor, window: int) -> Tensor:
     """Means over the window around each pixel, with zeros outside the image."""
-    image = F.pad(image, [window // 2] * 4)
-    for axis in (-1, -2):
-        for taps, apart in _SUMS[window]:
-            length = image.shape[axis] - (taps - 1) * apart
-            image = functools.reduce(torch.add, [image.narrow(axis, i * apart, length) for i in range(taps)])
-    return image / window**2
+    across = F.avg_pool2d(image, (1, window), 1, (0, window // 2))
+    return F.avg_pool2d(across, (window, 1), 1, (window // 2, 0))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.ops._window import accumulator_dtype
+from mcdenoise.ops._window import accumulator_dtype, block_means
 
 # The least number that a depth counts as, and how many near depths away the scene ends.
 _SHORTEST, _FARTHEST = 1e-30, 1e4
@@ -28,7 +27,7 @@ def auto_exposure(color: Tensor, key: float = 0.5) -> Tensor:
     """
     # Convert half precision to float32; keep float64.
     luminance = color.detach().to(torch.promote_types(color.dtype, torch.float32)).mean(1, keepdim=True)
-    blocks = F.avg_pool2d(luminance, 16, ceil_mode=True, count_include_pad=False)
+    blocks = block_means(luminance, 16)
     mean = blocks.mean((1, 2, 3), keepdim=True)
     lit = mean > 0
     # Relative to the mean, so that the logarithms are small at any exposure. Black blocks count as a thousandth of it.
@@ -106,13 +105,7 @@ def image_statistics(frame: Frame) -> dict[str, Tensor]:
     return found
 
 
-def guides_of(frame: Frame) -> list[Tensor]:
-    """Normal and depth in [0, 1], the guides of bilateral weights."""
-    _, normal, depth = features_of(frame)
-    near, typical = frame.statistics["depth_scale"].split(1, 1)
-    return [normal * 0.5 + 0.5, normalized_depth(depth, near, typical)]
-
-
 def unit_features_of(frame: Frame) -> list[Tensor]:
     """Albedo, normal and depth in [0, 1] for a frame with the statistics of :func:`image_statistics`."""
-    return [features_of(frame)[0], *guides_of(frame)]
+    albedo, normal, depth = features_of(frame)
+    return [albedo, normal * 0.5 + 0.5, normalized_depth(depth, *frame.statistics["depth_scale"].split(1, 1))]

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._constants import RELIT, RELIT_BLOCK, RELIT_DOUBT
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import block_means, corner
 
 # The channels of a history in which lag is looked for: color, mean of the compressed radiance and of its square, and
 # color and compressed radiance of a second, shorter history. A frame enters with the first five.
@@ -50,7 +50,7 @@ def light_changes(history: Tensor, length: Tensor, root: Tensor) -> Tensor:
     """
     history, root = history.detach(), root.detach().to(history.dtype)
     each = torch.cat([history[:, MEAN], history[:, RECENT_MEAN], root, root_variance(history, length)], 1)
-    blocks = F.avg_pool2d(each, RELIT_BLOCK, ceil_mode=True, count_include_pad=False)
+    blocks = block_means(each, RELIT_BLOCK)
     factors = root_changes(blocks, *history.shape[-2:])
     wide = F.interpolate(factors, scale_factor=RELIT_BLOCK, mode="bilinear", align_corners=False)
     one, short = torch.where(length > 1, corner(wide, *history.shape[-2:]), 1).split(1, 1)

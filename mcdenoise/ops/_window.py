@@ -128,16 +128,24 @@ def corner(image: Tensor, height: int, width: int) -> Tensor:
     return image.narrow(-2, 0, height).narrow(-1, 0, width)
 
 
-def inside(height: int, width: int, kernel_size: int, device: torch.device) -> Tensor:
-    """``(1, K*K, H, W)`` bool: whether each tap of each pixel lies inside the image."""
-    radius = kernel_size // 2
-    offset = torch.arange(kernel_size, device=device) - radius
-    row = torch.arange(height, device=device) + offset[:, None]
-    column = torch.arange(width, device=device) + offset[:, None]
-    row_inside = (row >= 0) & (row < height)
-    column_inside = (column >= 0) & (column < width)
-    both = row_inside[:, None, :, None] & column_inside[None, :, None, :]
-    return both.reshape(1, kernel_size * kernel_size, height, width)
+def block_means(image: Tensor, side: int) -> Tensor:
+    """Means over blocks of ``side x side`` pixels; those at the lower and right border have only the pixels there."""
+    if 0 in image.shape:
+        return image[..., ::side, ::side]
+    return F.avg_pool2d(image, side, ceil_mode=True, count_include_pad=False)
+
+
+def of_blocks(blocks: Tensor, side: int, height: int, width: int) -> Tensor:
+    """The image ``(..., H, W)`` in which all pixels of a block ``side x side`` have the block's value."""
+    return corner(blocks.repeat_interleave(side, -2).repeat_interleave(side, -1), height, width)
+
+
+def inside(kernel: Tensor, kernel_size: int) -> Tensor:
+    """``(1, K*K, H, W)`` bool: whether each tap of each pixel of kernels ``(B, K*K, H, W)`` lies inside the image."""
+    offset = torch.arange(kernel_size, device=kernel.device)[:, None] - kernel_size // 2
+    places = [(torch.arange(side, device=kernel.device) + offset, side) for side in kernel.shape[-2:]]
+    rows, columns = ((place >= 0) & (place < side) for place, side in places)
+    return (rows[:, None, :, None] & columns[None, :, None, :]).reshape(1, kernel_size**2, *kernel.shape[-2:])
 
 
 def accumulator_dtype(dtype: torch.dtype) -> torch.dtype:

@@ -78,17 +78,13 @@ def cross_bilateral_weights(
     exponent = _exponent(start, guides, falloffs, distance_falloff, kernel_size, border)
     if log_domain:
         if border == "renormalize":
-            exponent = torch.where(_inside(kernel, kernel_size), exponent, -torch.inf)
+            exponent = torch.where(inside(kernel, kernel_size), exponent, -torch.inf)
         weights = torch.softmax(exponent, 1)
     else:
         weights = kernel * torch.exp(exponent)
         if border == "renormalize":
-            weights = torch.where(_inside(kernel, kernel_size), weights, 0)
+            weights = torch.where(inside(kernel, kernel_size), weights, 0)
     return weights.to(kernel.dtype)
-
-
-def _inside(kernel: Tensor, kernel_size: int) -> Tensor:
-    return inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
 
 
 def check_settings(normalize: str, border: str) -> None:

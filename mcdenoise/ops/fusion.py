@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
 from mcdenoise.ops._module import module_of
-from mcdenoise.ops._window import accumulator_dtype, corner
+from mcdenoise.ops._window import accumulator_dtype, block_means, corner, of_blocks
 
 
 def downsample(image: Tensor) -> Tensor:
@@ -36,9 +36,7 @@ def downsample(image: Tensor) -> Tensor:
         [2.0, 3.5, 6.5, 8.0]
     """
     check_shapes(image=(image, "B C H W"))
-    if 0 in image.shape:
-        return image[..., ::2, ::2]
-    return F.avg_pool2d(image, 2, ceil_mode=True, count_include_pad=False)
+    return block_means(image, 2)
 
 
 def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -73,7 +71,7 @@ def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
             f"image: expected height and width {expected} for size {size}, found {tuple(image.shape[-2:])}"
         )
     if 0 in image.shape:
-        return corner(image.repeat_interleave(2, -2).repeat_interleave(2, -1), *size)
+        return of_blocks(image, 2, *size)
     return corner(F.interpolate(image, scale_factor=2, mode="nearest"), *size)
 
 

@@ -128,7 +128,7 @@ KernelSplat = module_of("KernelSplat", kernel_splat, check_border)
 
 def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:
     """``values`` over the sum of the weights whose taps are inside the image; 0 where that sum is 0."""
-    mask = inside(kernel.shape[-2], kernel.shape[-1], kernel_size, kernel.device)
+    mask = inside(kernel, kernel_size)
     total = torch.where(mask, kernel, 0).sum(1, keepdim=True).to(values.dtype)
     empty = total == 0
     # Divided, because the reciprocal of a very small sum is infinite.

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._check import check_shapes
-from mcdenoise.ops._window import Border, accumulator_dtype, corner, unpad
+from mcdenoise.ops._window import Border, accumulator_dtype, block_means, corner, unpad
 
 
 def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
@@ -47,7 +47,7 @@ def pyramid_partition(image: Tensor, logits: Tensor) -> tuple[Tensor, ...]:
     dtype = accumulator_dtype(image.dtype)
     source, weights = image.to(dtype), torch.softmax(logits.to(dtype), 1)
     parts = ((1 << level, source * weights[:, level : level + 1]) for level in range(levels))
-    return tuple(_block_means(part, side).to(image.dtype) for side, part in parts)
+    return tuple(block_means(part, side).to(image.dtype) for side, part in parts)
 
 
 def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, border: Border = "replicate") -> Tensor:
@@ -101,10 +101,3 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
     spread = (image.to(dtype)[:, :, None] * kernel.to(dtype)[:, None]).flatten(1, 2).flatten(2)
     whole = (2 * (found[0] + margin), 2 * (found[1] + margin))
     return corner(unpad(F.fold(spread, whole, side, stride=2), margin, border), *size).to(image.dtype)
-
-
-def _block_means(image: Tensor, side: int) -> Tensor:
-    """Means over blocks of ``side x side`` pixels; blocks at the border contain only the pixels of the image."""
-    if side == 1 or image.numel() == 0:
-        return image[..., ::side, ::side]
-    return F.avg_pool2d(image, side, ceil_mode=True, count_include_pad=False)

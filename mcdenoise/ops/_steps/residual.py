@@ -7,9 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._rows import by_rows
-from mcdenoise.ops._window import accumulator_dtype, pad
-
-__all__ = ["CELL", "REACH", "weight_of_noisy"]
+from mcdenoise.ops._window import accumulator_dtype, block_means, pad
 
 # Statistics are means over windows of CELLS x CELLS cells of CELL x CELL pixels. Over LAG pixels noise is uncorrelated,
 # also under a Gaussian pixel filter. A correlation counts as far as it exceeds DEVIATIONS standard deviations; GAIN is
@@ -42,11 +40,11 @@ def weight_of_noisy(color: Tensor, image: Tensor) -> Tensor:
 def _weight(color: Tensor, image: Tensor) -> Tensor:
     size = color.shape[-2], color.shape[-1]
     bright = image.mean(1, keepdim=True)
-    scale = _mean(bright, 3) + LEAST_MEAN * _pixels(_mean(_cells(bright), CELLS), size)
+    scale = _mean(bright, 3) + LEAST_MEAN * _pixels(_mean(block_means(bright, CELL), CELLS), size)
     r = ((color - image) / scale.clamp_min(DARKEST)).clamp(-MOST, MOST)
     squares, rows, columns = (_product(r, *lag) for lag in ((0, 0), (0, LAG), (LAG, 0)))
     statistics = (squares, rows + columns, rows * rows + columns * columns)
-    power, correlation, variance = _mean(torch.cat([_cells(each) for each in statistics], 1), CELLS).split(1, 1)
+    power, correlation, variance = _mean(block_means(torch.cat(statistics, 1), CELL), CELLS).split(1, 1)
     deviation = variance.clamp_min(LEAST_VARIANCE).sqrt() / (2 * CELL * CELLS)
     weight = GAIN * (correlation / 2 - DEVIATIONS * deviation) / power.clamp_min(LEAST_POWER)
     return _pixels(weight.clamp(0, 1), size)
@@ -57,11 +55,6 @@ def _product(r: Tensor, down: int, right: int) -> Tensor:
     height, width = r.shape[2:]
     product = r[..., down:, right:] * r[..., : max(height - down, 0), : max(width - right, 0)]
     return F.pad(product.sum(1, keepdim=True), (0, min(right, width), 0, min(down, height)))
-
-
-def _cells(image: Tensor) -> Tensor:
-    """Means over cells of 4x4 pixels, as far as they lie inside the image."""
-    return F.avg_pool2d(image, CELL, ceil_mode=True, count_include_pad=False)
 
 
 def _pixels(cells: Tensor, size: tuple[int, int]) -> Tensor:
@@ -80,9 +73,4 @@ def _pixels(cells: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _mean(image: Tensor, side: int) -> Tensor:
     """Means over the window around each pixel; outside the image, its edge is repeated."""
-    image = pad(image, side // 2, "replicate")
-    for axis in (-1, -2):
-        length = image.shape[axis] - side + 1
-        first, *others = (image.narrow(axis, start, length) for start in range(side))
-        image = sum(others, first)
-    return image / side**2
+    return F.avg_pool2d(pad(image, side // 2, "replicate"), side, 1)
