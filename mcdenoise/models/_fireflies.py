@@ -5,18 +5,18 @@ from __future__ import annotations
 import itertools
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.models._reads import at_hand
-from mcdenoise.ops._steps.history import incoming
+from mcdenoise.ops import clamp_fireflies
+from mcdenoise.ops._window import block_means
 
 # Of a pixel that is clamped in several frames in a row, the first one is believed to be as bright as its neighbours,
 # and each later one this many times as bright as the one before. So a star a thousand times as bright as its sky has
 # its light from the fifth frame on, while two fireflies in one place remain fireflies, also where the limit is 15.
 _GAIN = 6.0
-# Side of a block in pixels; number of rows of blocks that are examined; and the least number of lit blocks.
-_BLOCK, _STRIPS, _LEAST_BLOCKS = 32, 16, 16
+# Side of a block in pixels, and the least number of lit blocks.
+_BLOCK, _LEAST_BLOCKS = 32, 16
 
 
 def believed(full: Tensor, least: Tensor, limit: Tensor, before: Tensor | None, motion: Tensor | None) -> Tensor:
@@ -84,7 +84,7 @@ def light_of(color: Tensor) -> Tensor:
 
 
 def with_light(color: Tensor, before: Tensor, after: Tensor) -> Tensor:
-    """The color of pixels whose light, the sum of channels, was one and shall be another."""
+    """The color of pixels whose light, as a whole or of each channel, was one and shall be another."""
     # A quotient of equal numbers is exactly 1. The derivative of 0 / 0 would be NaN.
     lit = before > 0
     factor = torch.where(lit, after / torch.where(lit, before, 1), 1)
@@ -100,24 +100,12 @@ def light_of_fireflies(color: Tensor) -> Tensor:
     Returns:
         ``(B,)``; 0 for images with fewer than 16 lit blocks.
     """
-    color = color.detach()
-    height = color.shape[-2]
-    step = _BLOCK * -(-height // (_BLOCK * _STRIPS))
-    # A graph for images of any size has no strips.
-    whole = step == _BLOCK or torch.compiler.is_compiling()
-    strips = [color] if whole else [color[..., top : top + _BLOCK, :] for top in range(0, height, step)]
-    # Together, as images of a batch; the last one may be lower.
-    full = [strip for strip in strips if strip.shape[-2] == strips[0].shape[-2]]
-    fractions = []
-    for strip in (torch.cat(full) if full[1:] else full[0], *strips[len(full) :]):
-        light = strip.to(torch.promote_types(color.dtype, torch.float32))
-        before, after = (
-            F.avg_pool2d(image.mean(1, keepdim=True), _BLOCK, ceil_mode=True, count_include_pad=False)
-            for image in (light, incoming(light, compared=False))
-        )
-        # Not a number where there is no light to lose.
-        fractions.append((1 - after / before).unflatten(0, (-1, color.shape[0])).transpose(0, 1).flatten(1))
-    lost = torch.cat(fractions, 1)
+    light = color.detach().to(torch.promote_types(color.dtype, torch.float32))
+    before, after = (
+        block_means(image.mean(1, keepdim=True), _BLOCK).flatten(1) for image in (light, clamp_fireflies(light))
+    )
+    # Not a number where there is no light to lose.
+    lost = 1 - after / before
     # The lower median of all numbers, like nanmedian, which ONNX lacks.
     known = (~lost.isnan()).sum(1, keepdim=True)
     ascending = torch.where(lost.isnan(), torch.inf, lost).sort(1).values
