@@ -20,17 +20,8 @@ from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface
-from mcdenoise.ops._steps.history import (
-    COLOR,
-    MEAN,
-    RECENT,
-    RECENT_MEAN,
-    SQUARE,
-    blend,
-    incoming,
-    lights,
-    without_history,
-)
+from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE
+from mcdenoise.ops._steps.history import blend, incoming, lights, without_history
 from mcdenoise.ops.fireflies import LIMIT
 from mcdenoise.ops.lag import THRESHOLD
 
@@ -237,7 +228,7 @@ class Accumulated(Wrapper):
         limit = self._chosen(frame.color) if history is None else history.limit
         if blind and history is not None:
             limit = torch.where(limit > 0, limit, self._chosen(frame.color))
-        entering = incoming(frame.color, limit, compared=compared)
+        entering = self._incoming(frame, limit, compared=compared)
         seen = lights(entering[:, MEAN]) if compared else None
         if history is None:
             return self._begun(frame, entering, limit, seen, reset)
@@ -248,7 +239,7 @@ class Accumulated(Wrapper):
             # The light of a new shot may differ, and the cut is found only here.
             chosen = torch.where(cut, self._chosen(frame.color), limit)
             if not torch.equal(chosen, limit):
-                limit, entering = chosen, incoming(frame.color, chosen, compared=compared)
+                limit, entering = chosen, self._incoming(frame, chosen, compared=compared)
             if cut.all():
                 return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
@@ -262,6 +253,11 @@ class Accumulated(Wrapper):
         color, length = torch.where(cut, without_history(entering), color), torch.where(cut, 1, length)
         after = _history(frame, color, length, torch.where(cut, 0, limit) if blind else limit, carried, seen)
         return _Blended(after, entering, limit, motion, still, "", found, cut)
+
+    def _incoming(self, frame: Frame, limit: Tensor, *, compared: bool) -> Tensor:
+        # As a number, infinity takes no pass over the image.
+        unclamped = self.firefly_limit == math.inf
+        return incoming(frame.color, math.inf if unclamped else limit, compared=compared)
 
     def _begun(self, frame: Frame, entering: Tensor, limit: Tensor, seen: Tensor | None, reset: str) -> _Blended:
         """A frame without a history."""

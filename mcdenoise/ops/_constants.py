@@ -22,9 +22,6 @@ LABEL_WEIGHT = 1e-3
 # Parameter of Keys' bicubic kernel, its slope at a distance of 1; that of torch. Catmull-Rom splines have -0.5.
 CUBIC = -0.75
 
-# Side of the window in which a firefly is much brighter than its neighbours, in pixels.
-FIREFLY_WINDOW = 7
-
 # Smallest lag as a fraction of the local mean: a difference that no eye sees is no lag, however little noise there is.
 SMALLEST_LAG = 1e-3
 # Side of the window of means that are compared, in pixels.

@@ -9,13 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._check import check_kernel_size, check_positive, check_shapes
-from mcdenoise.ops._constants import FIREFLY_WINDOW
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype
 
 # At one sample a pixel ordinary noise is up to ten times as bright as the lit pixels around it.
 LIMIT = 15.0
-KERNEL_SIZE = FIREFLY_WINDOW
+KERNEL_SIZE = 7
 
 
 def clamp_fireflies(image: Tensor, *, limit: float | Tensor = LIMIT, kernel_size: int = KERNEL_SIZE) -> Tensor:

@@ -10,7 +10,7 @@ from reference_cases import slice_of_pixels, transposed
 from torch import Tensor
 
 from mcdenoise.ops import Surface, motion_from_position, use
-from mcdenoise.ops._history import light_changes
+from mcdenoise.ops._history import COLOR, MEAN, SQUARE, light_changes
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import history as steps
 
@@ -99,7 +99,7 @@ def passed(
         depth = position[:, 2:] if frame.depth is None and position is not None else frame.depth
         with use(backend):
             entering = steps.incoming(frame.color, limit, compared=tests)
-            seen = steps.lights(entering[:, steps.MEAN]) if tests else None
+            seen = steps.lights(entering[:, MEAN]) if tests else None
             if number == 0:
                 history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])
                 kept = torch.zeros(len(length))
@@ -117,7 +117,7 @@ def passed(
                     lag_threshold=lag_threshold,
                 )
         before = Surface(position, frame.normal, depth, seen)
-        results.append(Past(history[:, steps.COLOR].clone(), entering[:, steps.COLOR], length.clone(), kept))
+        results.append(Past(history[:, COLOR].clone(), entering[:, COLOR], length.clone(), kept))
     return results
 
 
@@ -176,7 +176,7 @@ def test_layout_in_memory_and_threads_change_nothing(
 def test_the_change_of_the_light_is_a_james_stein_estimate(root: float) -> None:
     size, variance, length = (1, 1, 80, 90), 0.1, 5.0
     history = torch.ones(1, 9, 80, 90, dtype=torch.float64)
-    history[:, steps.SQUARE] += variance * (length - 1) / length
+    history[:, SQUARE] += variance * (length - 1) / length
     lengths = torch.full(size, length, dtype=torch.float64)
     factors = light_changes(history, lengths, torch.full(size, root, dtype=torch.float64))
     change, powers = root - 1, torch.tensor([4, 4, 4, 1, 2, 4, 4, 4, 1], dtype=torch.float64)
@@ -200,4 +200,4 @@ def test_a_history_follows_a_change_of_the_light_that_noise_hides(light: float) 
         else:
             history, length = steps.without_history(entering), torch.ones_like(entering[:, :1])
     # A mean of 17 frames would follow a seventeenth of the way.
-    assert abs(float(history[:, steps.COLOR].mean()) / light - 1) < 0.03
+    assert abs(float(history[:, COLOR].mean()) / light - 1) < 0.03

@@ -15,7 +15,6 @@ from torch import Tensor
 from mcdenoise.ops._constants import (
     BRIGHTER,
     EVEN,
-    FIREFLY_WINDOW,
     LAG_WINDOW,
     LIGHT_WINDOW,
     RECENT_ALPHA,
@@ -24,95 +23,12 @@ from mcdenoise.ops._constants import (
     SMALLEST_LAG,
 )
 from mcdenoise.ops._history import Blended, root_changes
-from mcdenoise.ops._numba._runtime import add, compiled, copy_row, read_row, share_rows, source
+from mcdenoise.ops._numba._runtime import add, compiled, read_row, share_rows, source
 from mcdenoise.ops._numba.temporal import between, blended
 from mcdenoise.ops._surface import Surface
 from mcdenoise.ops._window import parts_of
 
 _RADIUS = LAG_WINDOW // 2
-
-
-def incoming(color: Tensor, limit: float | Tensor, compared: bool) -> Tensor:
-    """See :func:`mcdenoise.ops._steps.history.incoming`."""
-    dtype = torch.promote_types(color.dtype, torch.float32)
-    batch, channels, height, width = color.shape
-    result = torch.empty((batch, channels + 2 * compared, height, width), dtype=dtype, device="cpu")
-    if result.numel():
-        limits = limit.flatten() if isinstance(limit, Tensor) else result.new_full((batch,), limit)
-        out, image = result.numpy(), source(color.to(dtype))
-        # A power of two, which rounds nothing: no sum of a window overflows.
-        scale = result.new_tensor(2.0 ** -(channels * FIREFLY_WINDOW**2).bit_length()).numpy()[()]
-        sums, radius = result.new_empty((batch, 5, height, width)).numpy(), FIREFLY_WINDOW // 2
-        share_rows(color, lambda *rows: _sum_rows(sums, image, scale, radius, *rows), light=True)
-        arguments = (out, image, sums, limits.detach().to(dtype).numpy(), radius)
-        share_rows(color, lambda *rows: _clamp(*arguments, *rows), light=True)
-    return result
-
-
-@compiled
-def _sum_rows(sums: Any, image: Any, scale: float, radius: int, b: int, first: int, last: int) -> None:
-    """Brightness, in the last channel; sums of it beside each pixel, and with the pixel; and those of lit pixels."""
-    width = sums.shape[3]
-    one, zero = sums.dtype.type(1), sums.dtype.type(0)
-    padded, row = np.zeros(width + 2 * radius, sums.dtype), np.empty(width, sums.dtype)
-    inner = padded[radius : radius + width]
-    for y in range(first, last):
-        bright = sums[b, 4, y]
-        bright[:] = 0
-        for c in range(image[2]):
-            read_row(row, image, b, c, y, 0)
-            for x in range(width):
-                bright[x] += scale * row[x]
-        inner[:] = bright
-        for k in range(2):
-            sides, whole = sums[b, 2 * k, y], sums[b, 2 * k + 1, y]
-            # Never the pixel itself: subtracting a very bright one again would cancel its neighbours' digits.
-            sides[:] = 0
-            for d in range(1, radius + 1):
-                _add_both(sides, padded[radius - d :], padded[radius + d :])
-            whole[:] = 0
-            _add_both(whole, inner, sides)
-            for x in range(width):
-                inner[x] = one if bright[x] > zero else zero
-
-
-@compiled
-def _clamp(out: Any, image: Any, sums: Any, limits: Any, radius: int, b: int, first: int, last: int) -> None:
-    """Clamp fireflies, see :func:`mcdenoise.ops.clamp_fireflies`, and add the roots."""
-    _, _, height, width = out.shape
-    number, limit, channels = out.dtype.type, limits[b], image[2]
-    zero = number(0)
-    highest, lit = np.empty((2, width), out.dtype)
-    for y in range(first, last):
-        highest[:], lit[:] = sums[b, 0, y], sums[b, 2, y]
-        for row in range(max(y - radius, 0), min(y + radius + 1, height)):
-            if row != y:
-                add(highest, sums[b, 1, row])
-                add(lit, sums[b, 3, row])
-        inner = sums[b, 4, y]
-        for x in range(width):
-            # Without a lit neighbour a pixel is its own limit.
-            highest[x] = highest[x] * (limit / lit[x]) if lit[x] > zero else inner[x]
-        for c in range(channels):
-            values = out[b, c, y]
-            read_row(values, image, b, c, y, 0)
-            for x in range(width):
-                values[x] = values[x] / inner[x] * highest[x] if inner[x] > highest[x] else values[x]
-        if out.shape[1] == channels:
-            continue
-        root, square = out[b, channels, y], out[b, channels + 1, y]
-        root[:] = 0
-        for c in range(channels):
-            add(root, out[b, c, y])
-        for x in range(width):
-            root[x] = math.sqrt(math.sqrt(max(root[x] / number(channels), zero)))
-            square[x] = root[x] * root[x]
-
-
-@compiled
-def _add_both(total: Any, a: Any, b: Any) -> None:
-    for x in range(total.size):
-        total[x] += a[x] + b[x]
 
 
 def lights(root: Tensor) -> Tensor:
@@ -127,7 +43,7 @@ def lights(root: Tensor) -> Tensor:
 @compiled
 def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b: int, first: int, last: int) -> None:
     _, _, height, width = found.shape
-    number, strides = found.dtype.type, root[1]
+    number = found.dtype.type
     one, zero = number(1), number(0)
     size = 2 * radius + 1
     # The rows of the window, and the maximum and minimum of three successive pixels, at the last of them.
@@ -137,7 +53,7 @@ def _lights(found: Any, root: Any, even: float, brighter: float, radius: int, b:
     for ahead in range(max(first - radius, 0), last + radius):
         if ahead < height:
             values, high, low = ring[ahead % size], brightest[ahead % size], darkest[ahead % size]
-            copy_row(values, root, b * strides[0] + ahead * strides[2], strides[3])
+            read_row(values, root, b, 0, ahead, 0)
             for x in range(2, width):
                 high[x] = max(values[x - 2], max(values[x - 1], values[x]))
                 low[x] = min(values[x - 2], min(values[x - 1], values[x]))

@@ -18,33 +18,15 @@ from mcdenoise.ops._constants import (
     RECENT_FRAMES,
     STILL,
 )
-from mcdenoise.ops._history import COLOR, MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes, root_variance
+from mcdenoise.ops._history import MEAN, RECENT, RECENT_MEAN, SQUARE, Blended, light_changes, root_variance
 from mcdenoise.ops._op import op, plain
 from mcdenoise.ops._surface import Surface
-from mcdenoise.ops._window import corner
+from mcdenoise.ops._window import block_means, of_blocks
 from mcdenoise.ops.fireflies import LIMIT, clamp_fireflies
 from mcdenoise.ops.lag import history_lag
 from mcdenoise.ops.temporal import accumulate, check_accumulate
 
-__all__ = [
-    "COLOR",
-    "MEAN",
-    "RECENT",
-    "RECENT_MEAN",
-    "SQUARE",
-    "Blended",
-    "blend",
-    "incoming",
-    "lights",
-    "without_history",
-]
 
-
-def _check_incoming(color: Tensor, limit: float | Tensor) -> None:
-    check_shapes(color=(color, "B 3 H W"), limit=(limit if isinstance(limit, Tensor) else None, "[B 1 1 1]"))
-
-
-@op("numba", check=_check_incoming)
 def incoming(color: Tensor, limit: float | Tensor = LIMIT, *, compared: bool = True) -> Tensor:
     """A frame as it enters a history: without fireflies.
 
@@ -226,10 +208,5 @@ def _without_lag(
 
 def _lag(threshold: float, history: Tensor, recent: Tensor, variance: Tensor) -> Tensor:
     """The test in half the resolution, for a quarter of the time: a window holds as many pixels, in blocks of four."""
-    height, width = history.shape[-2:]
-    halves = (
-        F.avg_pool2d(image.detach(), 2, ceil_mode=True, count_include_pad=False)
-        for image in (history, recent, variance / 4)
-    )
-    lag = history_lag(*halves, threshold=threshold)
-    return corner(lag.repeat_interleave(2, -2).repeat_interleave(2, -1), height, width)
+    halves = (block_means(image.detach(), 2) for image in (history, recent, variance / 4))
+    return of_blocks(history_lag(*halves, threshold=threshold), 2, *history.shape[-2:])
