@@ -107,26 +107,24 @@ def readable(tensor: Tensor, dtype: torch.dtype) -> Tensor:
     return tensor if tensor.dtype == torch.bfloat16 and dtype == torch.float32 else tensor.to(dtype)
 
 
-def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool = False, step: int = 1) -> None:
+def share_rows(image: Tensor, run: Callable[[int, int, int], None], light: bool = False) -> None:
     """``run(b, first, last)`` for all rows of all images of the batch, on at most as many threads as torch uses.
 
     Args:
         image: an image of the same batch and size.
         run: computes rows of one image.
         light: whether there are only a few operations for each pixel, and so fewer threads.
-        step: ``first`` is a multiple of it, and ``last`` is too or is the height.
     """
     batch, _, height, width = image.shape
-    steps = -(-height // step)
     least = PIXELS_A_THREAD * (LIGHT if light else 1)
-    threads = max(1, min(torch.get_num_threads(), batch * steps, batch * height * width // least))
+    threads = max(1, min(torch.get_num_threads(), batch * height, batch * height * width // least))
 
     def compute(number: int) -> None:
-        done, end = batch * steps * number // threads, batch * steps * (number + 1) // threads
+        done, end = batch * height * number // threads, batch * height * (number + 1) // threads
         while done < end:
-            b, first = divmod(done, steps)
-            last = min(steps, first + end - done)
-            run(b, first * step, min(last * step, height))
+            b, first = divmod(done, height)
+            last = min(height, first + end - done)
+            run(b, first, last)
             done += last - first
 
     if threads == 1:
@@ -188,8 +186,10 @@ def _rounded_overload(value: Any, memory: Any) -> Any:
 
 
 @compiled
-def copy_row(row: Any, source: Any, start: int, stride: int) -> None:
-    memory = source[0]
+def read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
+    """A run of pixels of one channel."""
+    memory, strides, _ = image
+    start, stride = b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3], strides[3]
     if stride == 1:
         values = memory[start : start + row.size]
         for x in range(row.size):
@@ -197,13 +197,6 @@ def copy_row(row: Any, source: Any, start: int, stride: int) -> None:
     else:
         for x in range(row.size):
             row[x] = load(memory[start + x * stride])
-
-
-@compiled
-def read_row(row: Any, image: Any, b: int, c: int, y: int, x0: int) -> None:
-    """A run of pixels of one channel."""
-    strides = image[1]
-    copy_row(row, image, b * strides[0] + c * strides[1] + y * strides[2] + x0 * strides[3], strides[3])
 
 
 @compiled
@@ -222,6 +215,12 @@ def add_product(total: Any, a: Any, b: Any) -> None:
 def multiply(values: Any, factors: Any) -> None:
     for x in range(values.size):
         values[x] *= factors[x]
+
+
+@compiled
+def larger(total: Any, values: Any) -> None:
+    for x in range(total.size):
+        total[x] = max(total[x], values[x])
 
 
 def exp(value: Any) -> Any:

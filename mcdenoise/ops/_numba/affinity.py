@@ -106,27 +106,13 @@ def _average(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
 @compiled
 def _square(total: Any, own: Any, others: Any, b: int, y: int, x: int, row: int, start: int) -> None:
     """``|own[p] - others[q]|^2`` of a run of pixels and of their taps."""
-    n, count = total.size, own.shape[1]
-    most = total.dtype.type(FARTHEST_FEATURE)
+    n, most = total.size, total.dtype.type(FARTHEST_FEATURE)
     total[:] = 0
-    c = 0
-    # Four at a time: the sum is read and stored once for them.
-    while c + 4 <= count:
-        a0, a1 = own[b, c, y, x : x + n], own[b, c + 1, y, x : x + n]
-        a2, a3 = own[b, c + 2, y, x : x + n], own[b, c + 3, y, x : x + n]
-        b0, b1 = others[b, c, row, start : start + n], others[b, c + 1, row, start : start + n]
-        b2, b3 = others[b, c + 2, row, start : start + n], others[b, c + 3, row, start : start + n]
+    for c in range(own.shape[1]):
+        here, there = own[b, c, y, x : x + n], others[b, c, row, start : start + n]
         for i in range(n):
-            d0, d1, d2, d3 = a0[i] - b0[i], a1[i] - b1[i], a2[i] - b2[i], a3[i] - b3[i]
-            d0, d1, d2, d3 = _near(d0, most), _near(d1, most), _near(d2, most), _near(d3, most)
-            total[i] += (d0 * d0 + d1 * d1) + (d2 * d2 + d3 * d3)
-        c += 4
-    while c < count:
-        a0, b0 = own[b, c, y, x : x + n], others[b, c, row, start : start + n]
-        for i in range(n):
-            d0 = _near(a0[i] - b0[i], most)
-            total[i] += d0 * d0
-        c += 1
+            difference = _near(here[i] - there[i], most)
+            total[i] += difference * difference
 
 
 @compiled

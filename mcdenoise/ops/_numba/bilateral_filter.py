@@ -24,10 +24,11 @@ from mcdenoise.ops._numba._runtime import (
     add,
     add_product,
     compiled,
-    copy_row,
     exp,
+    larger,
     load,
     multiply,
+    read_row,
     readable,
     share_rows,
     source,
@@ -44,13 +45,12 @@ _REPLICATE, _ZEROS, _RENORMALIZE = range(len(BORDERS))
 
 
 class _Inputs(NamedTuple):
-    """The inputs of a filter; a guide or a falloff that is not given has no channels."""
+    """Inputs of a filter: what is not given has no channels, and the last falloff is that of the distance."""
 
     kernel: Source
     image: Source
     guides: tuple[Source, ...]
     falloffs: tuple[Source, ...]
-    distance: Source
     height: int
     width: int
     kernel_size: int
@@ -72,12 +72,12 @@ def cross_bilateral_filter(
     out = torch.empty(image.shape, dtype=dtype, device="cpu")
     if out.numel():
         nothing = source(torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu"))
+        distance = nothing if distance_falloff is None else source(distance_falloff.to(dtype))
         inputs = _Inputs(
             source(readable(kernel, dtype)),
             source(image.to(dtype)),
             _filled_up([source(guide.to(dtype)) for guide in guides], nothing),
-            _filled_up([source(scale.to(dtype)) for scale in falloffs], nothing),
-            nothing if distance_falloff is None else source(distance_falloff.to(dtype)),
+            (*_filled_up([source(scale.to(dtype)) for scale in falloffs], nothing), distance),
             image.shape[2],
             image.shape[3],
             kernel_size_of(kernel.shape[1], "kernel"),
@@ -95,16 +95,14 @@ def _filled_up(values: list[Any], nothing: Any) -> tuple[Any, ...]:
 @compiled
 def _fetch(rows: Any, source: Any, b: int, y: int, height: int, radius: int, border: int) -> None:
     """Row ``y`` of each channel, which may lie beyond the image, with ``radius`` more pixels at both ends."""
-    _, strides, channels = source
     width = rows.shape[1] - 2 * radius
-    for c in range(channels):
+    for c in range(source[2]):
         row = rows[c]
         if border != _REPLICATE and (y < 0 or y >= height):
             row[:] = 0
             continue
-        nearest = min(max(y, 0), height - 1)
         inner = row[radius : radius + width]
-        copy_row(inner, source, b * strides[0] + c * strides[1] + nearest * strides[2], strides[3])
+        read_row(inner, source, b, c, min(max(y, 0), height - 1), 0)
         if border == _REPLICATE:
             row[:radius] = inner[0]
             row[radius + width :] = inner[width - 1]
@@ -133,7 +131,7 @@ def _read_taps(taps: Any, kernel: Any, b: int, y: int, x0: int, n: int) -> None:
                 taps[t, x] = load(values[t])
     else:
         for t in range(count):
-            copy_row(taps[t, :n], kernel, start + t * strides[1], strides[3])
+            read_row(taps[t, :n], kernel, b, t, y, x0)
 
 
 @compiled
@@ -173,7 +171,7 @@ def _weigh(
 
     Where the weights are the kernel, nothing is multiplied, and ``factors`` may have no rows.
     """
-    kernel, image, guides, falloffs, distance, height, width, kernel_size, log_domain, border = inputs
+    kernel, image, guides, falloffs, height, width, kernel_size, log_domain, border = inputs
     radius = kernel_size // 2
     taps = weights.shape[0]
     guided = _is_guided(inputs)
@@ -186,7 +184,9 @@ def _weigh(
     else:
         factors[:, :n] = 0 if adjusted else 1
     if guided:
-        _read_falloffs(falloff, falloffs, distance, b, y, x0, n)
+        for g in range(len(falloffs)):
+            if falloffs[g][2] > 0:
+                read_row(falloff[g, :n], falloffs[g], b, 0, y, x0)
         centres = ring[y % kernel_size]
         for t in range(taps):
             dy, dx = t // kernel_size - radius, t % kernel_size - radius
@@ -200,7 +200,7 @@ def _weigh(
                         exponent, falloff[g, :n], neighbours[channel:end], centres[channel:end], dx, x0 + radius
                     )
                 channel = end
-            if distance[2] > 0:
+            if falloffs[len(guides)][2] > 0:
                 _subtract_multiple(exponent, falloff[len(guides), :n], dy * dy + dx * dx)
     if border == _RENORMALIZE:
         for t in range(taps):
@@ -216,7 +216,7 @@ def _weigh(
     if log_domain:
         maximum[:] = weights[0, :n]
         for t in range(1, taps):
-            _maximum(maximum, weights[t, :n])
+            larger(maximum, weights[t, :n])
         inverse[:] = 0
         for t in range(taps):
             _exponential(weights[t, :n], maximum)
@@ -236,18 +236,6 @@ def _weigh(
 
 
 @compiled
-def _read_falloffs(falloff: Any, falloffs: Any, distance: Any, b: int, y: int, x0: int, n: int) -> None:
-    for g in range(len(falloffs)):
-        if falloffs[g][2] > 0:
-            strides = falloffs[g][1]
-            copy_row(falloff[g, :n], falloffs[g], b * strides[0] + y * strides[2] + x0 * strides[3], strides[3])
-    if distance[2] > 0:
-        strides = distance[1]
-        start = b * strides[0] + y * strides[2] + x0 * strides[3]
-        copy_row(falloff[len(falloffs), :n], distance, start, strides[3])
-
-
-@compiled
 def _exponential(values: Any, offset: Any) -> None:
     for x in range(values.size):
         values[x] = exp(values[x] - offset[x])
@@ -262,14 +250,8 @@ def _make_finite(values: Any) -> None:
 
 
 @compiled
-def _maximum(total: Any, values: Any) -> None:
-    for x in range(total.size):
-        total[x] = max(total[x], values[x])
-
-
-@compiled
 def _is_guided(inputs: Any) -> bool:
-    return bool(_channels_of(inputs) > inputs.image[2] or inputs.distance[2] > 0)
+    return bool(_channels_of(inputs) > inputs.image[2] or inputs.falloffs[len(inputs.guides)][2] > 0)
 
 
 @compiled
@@ -290,7 +272,7 @@ def _forward(out: Any, inputs: Any, b: int, first: int, last: int) -> None:
     weights = np.empty((taps, chunk), out.dtype)
     adjusted = _is_guided(inputs) or inputs.border == _RENORMALIZE
     factors = np.empty((taps if adjusted and not log_domain else 0, chunk), out.dtype)
-    falloff = np.empty((len(inputs.falloffs) + 1, chunk), out.dtype)
+    falloff = np.empty((len(inputs.falloffs), chunk), out.dtype)
     inverse, maximum = np.empty(chunk, out.dtype), np.empty(chunk, out.dtype)
     for row in range(first - radius, last + radius):
         _fetch_all(ring, inputs, b, row)

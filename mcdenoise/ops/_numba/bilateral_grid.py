@@ -114,19 +114,13 @@ def _add_row(cells: Any, values: Any, places: Any, weights: Any, where: Any, hei
     """A row of pixels in the four cells around each in one row of cells."""
     column_weights, next_column = where.column_weights, where.bins + 2
     for x in range(places.size):
-        p0, p1, p2, p3 = values[0, x], values[1, x], values[2, x], values[3, x]
         for side in range(2):
             wide = height * column_weights[side, x]
             i = places[x] + side * next_column
             a, b = wide * weights[0, x], wide * weights[1, x]
-            cells[i, 0] += a * p0
-            cells[i, 1] += a * p1
-            cells[i, 2] += a * p2
-            cells[i, 3] += a * p3
-            cells[i + 1, 0] += b * p0
-            cells[i + 1, 1] += b * p1
-            cells[i + 1, 2] += b * p2
-            cells[i + 1, 3] += b * p3
+            for k in range(_SIDE_BY_SIDE):
+                cells[i, k] += a * values[k, x]
+                cells[i + 1, k] += b * values[k, x]
 
 
 @compiled
@@ -232,15 +226,8 @@ def _read_row(sums: Any, upper: Any, lower: Any, places: Any, weights: Any, wher
         i = places[x]
         j = i + next_column
         a, b, c, d = above * columns[0, x], above * columns[1, x], below * columns[0, x], below * columns[1, x]
-        p0 = a * upper[i, 0] + b * upper[j, 0] + c * lower[i, 0] + d * lower[j, 0]
-        p1 = a * upper[i, 1] + b * upper[j, 1] + c * lower[i, 1] + d * lower[j, 1]
-        p2 = a * upper[i, 2] + b * upper[j, 2] + c * lower[i, 2] + d * lower[j, 2]
-        p3 = a * upper[i, 3] + b * upper[j, 3] + c * lower[i, 3] + d * lower[j, 3]
-        i, j = i + 1, j + 1
-        q0 = a * upper[i, 0] + b * upper[j, 0] + c * lower[i, 0] + d * lower[j, 0]
-        q1 = a * upper[i, 1] + b * upper[j, 1] + c * lower[i, 1] + d * lower[j, 1]
-        q2 = a * upper[i, 2] + b * upper[j, 2] + c * lower[i, 2] + d * lower[j, 2]
-        q3 = a * upper[i, 3] + b * upper[j, 3] + c * lower[i, 3] + d * lower[j, 3]
         near, far = weights[0, x], weights[1, x]
-        sums[0, x], sums[1, x] = near * p0 + far * q0, near * p1 + far * q1
-        sums[2, x], sums[3, x] = near * p2 + far * q2, near * p3 + far * q3
+        for k in range(_SIDE_BY_SIDE):
+            p = a * upper[i, k] + b * upper[j, k] + c * lower[i, k] + d * lower[j, k]
+            q = a * upper[i + 1, k] + b * upper[j + 1, k] + c * lower[i + 1, k] + d * lower[j + 1, k]
+            sums[k, x] = near * p + far * q

@@ -17,6 +17,7 @@ from mcdenoise.ops._numba._runtime import (
     add_product,
     compiled,
     exp,
+    larger,
     multiply,
     read_row,
     readable,
@@ -58,7 +59,7 @@ def _average(out: Any, image: Any, importance: Any, kernel_size: int, b: int, fi
         start, end = max(y - radius, 0), min(y + radius + 1, height)
         maximum[:] = maxima[start % kernel_size]
         for r in range(start + 1, end):
-            _maximum(maximum, maxima[r % kernel_size])
+            larger(maximum, maxima[r % kernel_size])
         total[:] = 0
         for r in range(start, end):
             at = r % kernel_size
@@ -80,8 +81,8 @@ def _average_row(maximum: Any, total: Any, mean: Any, pixels: Any, weights: Any,
     importance = pixels[channels]
     maximum[:] = importance
     for side in range(1, min(radius, width - 1) + 1):
-        _maximum(maximum[: width - side], importance[side:])
-        _maximum(maximum[side:], importance[: width - side])
+        larger(maximum[: width - side], importance[side:])
+        larger(maximum[side:], importance[: width - side])
     total[:] = 0
     mean[:] = 0
     # Pixels outside the image add nothing.
@@ -97,12 +98,6 @@ def _average_row(maximum: Any, total: Any, mean: Any, pixels: Any, weights: Any,
         _divide(weight, total[start:end])
         for c in range(channels):
             add_product(mean[c, start:end], weight, pixels[c, start + dx : end + dx])
-
-
-@compiled
-def _maximum(maximum: Any, values: Any) -> None:
-    for x in range(maximum.size):
-        maximum[x] = max(maximum[x], values[x])
 
 
 @compiled
