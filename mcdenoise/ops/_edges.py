@@ -25,6 +25,7 @@ def check_sigmas(sigma_z: float, sigma_n: float, sigma_l: float = 1.0) -> None:
         raise ValueError(f"sigma_n: expected at least 1, found {sigma_n}")
 
 
+@op("numba")
 def edge_average(
     image: Tensor,
     noise: Tensor,
@@ -57,41 +58,28 @@ def edge_average(
         ``a`` of the kernel and of the edge-stopping weights.
     """
     normal, depth = (None if each is None else each.to(image.dtype) for each in (normal, depth))
-    return average(image, noise, normal, depth, bright, deviation, list(kernel), step, sigma_z, sigma_n)
-
-
-@op("numba")
-def average(
-    image: Tensor,
-    noise: Tensor,
-    normal: Tensor | None,
-    depth: Tensor | None,
-    bright: Tensor | None,
-    deviation: Tensor | None,
-    kernel: Sequence[float],
-    step: int,
-    sigma_z: float,
-    sigma_n: float,
-) -> tuple[Tensor, Tensor]:
-    """See :func:`edge_average`; all images have one dtype."""
     height, width = image.shape[-2:]
     radius = len(kernel) // 2 * step
-    factors: list[Callable[[int, int], Tensor]] = []
+    # What a tap is compared by, and its weight from that and its offset.
+    guides: list[tuple[Tensor, Callable[[Tensor, int, int], Tensor]]] = []
     if depth is not None:
-        factors.append(_of_depth(depth, radius, sigma_z))
+        hit = torch.isfinite(depth)
+        z = torch.where(hit, depth, 0)
+        guides.append((torch.cat([z, hit.to(z.dtype)], 1), _of_depth(z, hit, sigma_z)))
     if normal is not None:
-        factors.append(_of_normal(normal, radius, sigma_n))
+        guides.append((normal, _of_normal(normal, sigma_n)))
     if bright is not None and deviation is not None:
-        factors.append(_of_luminance(bright, deviation, radius))
-    channels = [image.shape[1], noise.shape[1], 1]
-    padded = pad(torch.cat([image, noise, torch.ones_like(image[:, :1])], 1), radius, "zeros")
+        guides.append((bright, _of_luminance(bright, deviation)))
+    images = [image, noise, torch.ones_like(image[:, :1]), *(guide for guide, _ in guides)]
+    channels, padded = [each.shape[1] for each in images], pad(torch.cat(images, 1), radius, "zeros")
     total, image_sum, noise_sum = torch.zeros_like(image[:, :1]), torch.zeros_like(image), torch.zeros_like(noise)
     for tap, dy, dx in offsets(len(kernel)):
         row, column = divmod(tap, len(kernel))
-        seen, variance, inside = shifted(padded, radius, dy * step, dx * step, height, width).split(channels, 1)
+        moved = shifted(padded, radius, dy * step, dx * step, height, width)
+        seen, variance, inside, *others = moved.split(channels, 1)
         weight = kernel[row] * kernel[column] * inside
-        for factor in factors:
-            weight = weight * factor(dy * step, dx * step)
+        for (_, factor), other in zip(guides, others, strict=True):
+            weight = weight * factor(other, dy * step, dx * step)
         total = total + weight
         image_sum = image_sum + weight * seen
         noise_sum = noise_sum + weight.square() * variance
@@ -103,13 +91,9 @@ def bounded_quotient(difference: Tensor, tolerance: Tensor) -> Tensor:
     return difference / torch.maximum(tolerance, difference.detach() / HIGHEST_QUOTIENT)
 
 
-def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int], Tensor]:
-    height, width = normal.shape[-2:]
-    padded = pad(normal, radius, "zeros")
-
-    def weight(dy: int, dx: int) -> Tensor:
-        squared = (shifted(padded, radius, dy, dx, height, width) - normal).square().sum(1, keepdim=True)
-        cosine = 1 - squared / 2
+def _of_normal(normal: Tensor, sigma: float) -> Callable[[Tensor, int, int], Tensor]:
+    def weight(other: Tensor, dy: int, dx: int) -> Tensor:
+        cosine = 1 - (other - normal).square().sum(1, keepdim=True) / 2
         unlike = cosine <= 0
         # The second derivative of a power of 0 may be infinite.
         return torch.where(unlike, 0, torch.where(unlike, 1, cosine) ** sigma)  # Eq. 4
@@ -117,30 +101,19 @@ def _of_normal(normal: Tensor, radius: int, sigma: float) -> Callable[[int, int]
     return weight
 
 
-def _of_luminance(bright: Tensor, deviation: Tensor, radius: int) -> Callable[[int, int], Tensor]:
-    height, width = bright.shape[-2:]
-    padded = pad(bright, radius, "zeros")
-
-    def weight(dy: int, dx: int) -> Tensor:
-        difference = (shifted(padded, radius, dy, dx, height, width) - bright).abs()
-        return torch.exp(-bounded_quotient(difference, deviation))  # Eq. 5
-
-    return weight
+def _of_luminance(bright: Tensor, deviation: Tensor) -> Callable[[Tensor, int, int], Tensor]:
+    return lambda other, dy, dx: torch.exp(-bounded_quotient((other - bright).abs(), deviation))  # Eq. 5
 
 
-def _of_depth(depth: Tensor, radius: int, sigma: float) -> Callable[[int, int], Tensor]:
-    height, width = depth.shape[-2:]
-    hit = torch.isfinite(depth)
-    z = torch.where(hit, depth, 0)
+def _of_depth(z: Tensor, hit: Tensor, sigma: float) -> Callable[[Tensor, int, int], Tensor]:
     slope_x, slope_y = _slope(z, hit, -1), _slope(z, hit, -2)
     least = DEPTH_EPSILON * z + LEAST_DEPTH
-    padded, padded_hit = pad(z, radius, "zeros"), F.pad(hit, (radius,) * 4)
 
-    def weight(dy: int, dx: int) -> Tensor:
-        difference = (shifted(padded, radius, dy, dx, height, width) - z).abs()
+    def weight(other: Tensor, dy: int, dx: int) -> Tensor:
+        there, other_hit = other.split(1, 1)
         tolerance = sigma * (slope_x * dx + slope_y * dy).abs() + least
-        alike = shifted(padded_hit, radius, dy, dx, height, width) == hit
-        return torch.where(alike, torch.exp(-bounded_quotient(difference, tolerance)), 0)  # Eq. 3
+        near = torch.exp(-bounded_quotient((there - z).abs(), tolerance))
+        return torch.where(other_hit == hit, near, 0)  # Eq. 3
 
     return weight
 

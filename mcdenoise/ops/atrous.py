@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._check import check_least, check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype, pad
@@ -19,7 +19,7 @@ _KERNEL = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
 _LEAST_DEVIATION = 1e-18
 
 
-@made_of(average)
+@made_of(edge_average)
 def atrous(
     light: Tensor,
     variance: Tensor,

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.ops._check import check_least, check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, bounded_quotient, check_sigmas, edge_average
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, bounded_quotient, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._numbers import unit_of
 from mcdenoise.ops._op import made_of
@@ -21,7 +21,7 @@ THRESHOLD = 2.0
 _BLACK, _NOISIEST = 1e-15, 1e30
 
 
-@made_of(average)
+@made_of(edge_average)
 def temporal_gradient(
     current: Tensor,
     previous: Tensor,

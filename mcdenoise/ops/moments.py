@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.ops._check import check_kernel_size, check_shapes
-from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, average, check_sigmas, edge_average
+from mcdenoise.ops._edges import SIGMA_N, SIGMA_Z, check_sigmas, edge_average
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._op import made_of
 from mcdenoise.ops._window import accumulator_dtype
@@ -45,7 +45,7 @@ def luminance_moments(light: Tensor) -> Tensor:
     return torch.cat([bright, bright.square()], 1)
 
 
-@made_of(average)
+@made_of(edge_average)
 def moments_variance(
     moments: Tensor,
     normal: Tensor | None = None,

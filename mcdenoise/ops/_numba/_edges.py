@@ -34,8 +34,8 @@ class _Inputs(NamedTuple):
     slope: Any
 
 
-def average(*arguments: Any) -> tuple[Tensor, Tensor]:
-    """See :func:`mcdenoise.ops._edges.average`."""
+def edge_average(*arguments: Any) -> tuple[Tensor, Tensor]:
+    """See :func:`mcdenoise.ops._edges.edge_average`."""
     inputs = _inputs(*arguments)
     mean, variance = (torch.from_numpy(np.empty_like(each)) for each in (inputs.image, inputs.noise))
     if mean.numel():
@@ -47,7 +47,9 @@ def average(*arguments: Any) -> tuple[Tensor, Tensor]:
 def _inputs(*arguments: Any) -> _Inputs:
     image, *_, kernel, step, sigma_z, sigma_n = arguments
     nothing = image.new_empty((len(image), 0, *image.shape[2:]))
-    arrays = [(nothing if each is None else each.detach().contiguous()).numpy() for each in arguments[:6]]
+    arrays = [
+        (nothing if each is None else each.detach().to(image.dtype).contiguous()).numpy() for each in arguments[:6]
+    ]
     settings = (image.new_tensor(each).numpy() for each in (kernel, (sigma_z, sigma_n)))
     depth = arrays[3]
     slope = np.empty((len(depth), 2 * depth.shape[1], *depth.shape[2:]), depth.dtype)
