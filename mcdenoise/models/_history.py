@@ -126,7 +126,7 @@ def _is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | T
     if frame.motion is not None:
         if blind:
             return ~frame.motion.any()
-        return not (_thinned(frame.motion).any() or frame.motion.any())
+        return not frame.motion.any()
     pairs = [(previous_view_projection, frame.view_projection)]
     if frame.previous_position is not None:
         pairs.append((frame.position, frame.previous_position))
@@ -134,7 +134,7 @@ def _is_still(frame: Frame, previous_view_projection: Tensor | None) -> bool | T
     if frame.position is None or len(known) < len(pairs):
         return False
     if not blind:
-        still = all(_equal(a, b) for a, b in known)
+        still = all(a is b or torch.equal(a, b) for a, b in known)
         if still or len(frame.color) == 1:
             return still
     return torch.stack([torch.eq(a, b).flatten(1).all(1) for a, b in known]).all(0)[:, None, None, None]
@@ -179,12 +179,3 @@ def _notes(frame: Frame, reset: str, history: float | Tensor) -> tuple[Note, ...
         Note("reproject", reset or "the image of the frame before", float(reset != "")),
         Note("remember", "for the next frame" if keeps else "last frame", float(not keeps)),
     )
-
-
-def _equal(a: Tensor, b: Tensor) -> bool:
-    return a is b or (torch.equal(_thinned(a), _thinned(b)) and torch.equal(a, b))
-
-
-def _thinned(image: Tensor) -> Tensor:
-    """One pixel in 64: enough to detect most motion."""
-    return image[..., ::8, ::8]

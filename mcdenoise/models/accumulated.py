@@ -184,7 +184,9 @@ class Accumulated(Wrapper):
         channels = RECENT.stop if math.isfinite(self.lag_threshold) else COLOR.stop
         history = own_state(kept, History, frame, channels=channels)
         frame = frame.with_depth()
-        reset = self._reset(frame, history)
+        reset = reset_of(frame, history)
+        if history is not None and not reset:
+            reset = self._other_buffers(history, frame)
         keeps = frame.hints.keep_all or not frame.hints.last
         # A frame without a history, which will not be part of one, needs no test for lag.
         compared = math.isfinite(self.lag_threshold) and (keeps or not reset)
@@ -216,11 +218,6 @@ class Accumulated(Wrapper):
         next_state = None if after is None and inner is None else (after, inner)
         return output._replace(stages=stages).noted(*notes), next_state
 
-    def _reset(self, frame: Frame, history: History | None) -> str:
-        """Why the frame cannot have this history; empty if it can, unless there is a cut."""
-        reset = reset_of(frame, history)
-        return reset if history is None else reset or self._other_buffers(history, frame)
-
     def _blended(self, frame: Frame, history: History | None, reset: str, compared: bool) -> _Blended:
         """The frame with its history, where it has one and there is no cut."""
         # In a graph and on a GPU no value is read: both branches of each decision are computed.
@@ -237,9 +234,8 @@ class Accumulated(Wrapper):
         found, cut = kept.mean(), (kept < CUT_FRACTION)[:, None, None, None]
         if not blind and cut.any():
             # The light of a new shot may differ, and the cut is found only here.
-            chosen = torch.where(cut, self._chosen(frame.color), limit)
-            if not torch.equal(chosen, limit):
-                limit, entering = chosen, self._incoming(frame, chosen, compared=compared)
+            limit = torch.where(cut, self._chosen(frame.color), limit)
+            entering = self._incoming(frame, limit, compared=compared)
             if cut.all():
                 return self._begun(frame, entering, limit, seen, "cut")._replace(found=found)
         carried = self._blend_carried(frame, entering, seen, history, motion)
@@ -333,11 +329,8 @@ class Accumulated(Wrapper):
 
     def _entering(self, frame: Frame, entering: Tensor) -> list[Tensor | None]:
         """Layers (without fireflies), alpha and the buffers of ``also`` as they enter the history: ``(B, 3, H, W)``."""
-        parts: list[Tensor | None] = list(frame.layers.values())
-        if parts:
-            lit = frame.color > 0
-            scale = torch.where(lit, entering[:, COLOR] / torch.where(lit, frame.color, 1), 1)
-            parts = [part * scale for part in frame.layers.values()]
+        layers = (layer.to(entering.dtype) for layer in frame.layers.values())
+        parts: list[Tensor | None] = [with_light(layer, frame.color, entering[:, COLOR]) for layer in layers]
         if (alpha := alpha_of(frame)) is not None:
             parts.append(alpha.expand(-1, COLOR.stop, -1, -1))
         parts += [frame.buffer(name) for name in self.also]
