@@ -116,31 +116,22 @@ class Bmfr(nn.Module):
         assert frame.position is not None
         features = torch.cat([frame.normal, frame.position], 1)
         # Images of a batch may be at different frame numbers; the offset is looked up on the device.
-        rows, columns = self._starts[number.flatten().long()].unbind(1)
-        image, guide = (_moved(_moved(each, rows, -2), columns, -1) for each in (images, features))
-        fitted = block_regression(image, guide, squares=3)
-        height, width = frame.size
-        return _moved_back(_moved_back(fitted, rows, -2, height), columns, -1, width).clamp_min(0)
+        starts = self._starts[number.flatten().long()].mT[..., None]
+        whole, back = [], []
+        for size, start in zip(frame.size, starts.unbind(), strict=True):
+            places = torch.arange(parts_of(size + BLOCK - 1, BLOCK) * BLOCK, device=start.device)
+            # Beyond the image its pixels are mirrored.
+            whole.append(mirrored_places(places - start, size))
+            back.append(torch.arange(size, device=start.device) + start)
+        fitted = block_regression(_gathered(images, *whole), _gathered(features, *whole), squares=3)
+        return _gathered(fitted, *back).clamp_min(0)
 
 
-def _moved(image: Tensor, starts: Tensor, axis: int) -> Tensor:
-    """Shift each image ``(B, C, H, W)`` by its offset and pad it by reflection to whole blocks."""
-    size = image.shape[axis]
-    places = torch.arange(parts_of(size + BLOCK - 1, BLOCK) * BLOCK, device=image.device)
-    return _gathered(image, mirrored_places(places - starts[:, None], size), axis)
-
-
-def _moved_back(blocks: Tensor, starts: Tensor, axis: int, size: int) -> Tensor:
-    """The inverse of :func:`_moved`."""
-    return _gathered(blocks, torch.arange(size, device=blocks.device) + starts[:, None], axis)
-
-
-def _gathered(image: Tensor, places: Tensor, axis: int) -> Tensor:
-    """Gather indices ``(B, N)`` along one of the last two axes, separately for each image of a batch."""
-    index = places[:, None, :, None] if axis == -2 else places[:, None, None, :]
-    shape = list(image.shape)
-    shape[axis] = places.shape[1]
-    return image.gather(axis, index.expand(shape))
+def _gathered(image: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """The pixels at some rows ``(B, N)`` and columns ``(B, M)`` of each image of a batch, ``(B, C, N, M)``."""
+    index = (rows[:, :, None] * image.shape[-1] + columns[:, None]).flatten(1)[:, None]
+    found = image.flatten(2).gather(2, index.expand(-1, image.shape[1], -1))
+    return torch.unflatten(found, 2, (rows.shape[1], columns.shape[1]))
 
 
 @register_model("bmfr", kind="filter", paper="Koskela et al. 2019")
