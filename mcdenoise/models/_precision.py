@@ -6,8 +6,6 @@ import os
 import platform
 import statistics
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -17,6 +15,7 @@ from mcdenoise.errors import check_choice
 from mcdenoise.models._interface import Model
 from mcdenoise.models._stopwatch import Stopwatch
 from mcdenoise.models._wrapper import Wrapper, parts_of
+from mcdenoise.nn._cpu import has_fused_convolution
 from mcdenoise.nn.oidn import OidnUNet
 from mcdenoise.user_cache import measured_once
 
@@ -69,21 +68,15 @@ def has_network(model: Model) -> bool:
     return model.needs.trainable or loads or any(True for _ in parts_of(model, OidnUNet))
 
 
-@contextmanager
-def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
+def computing_in(precision: Precision, device: torch.device) -> torch.autocast:
     """Run convolutions in this precision."""
-    with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
-        yield
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16")
 
 
 def _has_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device) >= (8, 0)
-    try:
-        return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
-    except AttributeError:
-        # torch was built without oneDNN.
-        return False
+    return has_fused_convolution(torch.bfloat16)
 
 
 def _measured(device: torch.device) -> float:

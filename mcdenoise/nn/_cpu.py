@@ -123,7 +123,8 @@ def _without_autocast(device_type: str) -> AbstractContextManager[object]:
 
 
 @functools.cache
-def _has_fused_convolution(dtype: torch.dtype) -> bool:
+def has_fused_convolution(dtype: torch.dtype) -> bool:
+    """Whether oneDNN convolves numbers of a dtype on this processor."""
     try:
         onednn = torch.ops.mkldnn
         supported = {torch.float32: True, torch.bfloat16: onednn._is_mkldnn_bf16_supported()}
@@ -137,4 +138,4 @@ def _is_fused(x: Tensor, dtype: torch.dtype) -> bool:
     """Whether oneDNN convolves, and applies a function to the result in the same step."""
     inference = x.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_compiling()
     # It has no rule for derivatives in forward mode, which are zero then.
-    return inference and not is_transformed() and _has_fused_convolution(dtype)
+    return inference and not is_transformed() and has_fused_convolution(dtype)
