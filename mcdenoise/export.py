@@ -206,14 +206,13 @@ def export_model(
     program = traced(step)
     inputs = (*step.given, *(f"state.{each}" for each in step.state))
     outputs = ("image", *(f"next_state.{each}" for each in step.state))
-    exported = Exported(path, inputs, outputs, len(program.graph.nodes))
     about = {"model": name or type(model).__name__, "mcdenoise": version("mcdenoise"), "torch": torch.__version__}
     with atomic_path(path) as temporary, _quiet():
         if path.suffix == ".onnx":
-            _write_onnx(program, temporary, exported, about)
+            _write_onnx(program, temporary, inputs, outputs, about)
         else:
             torch.export.save(program, temporary, extra_files=about)
-    return exported
+    return Exported(path, inputs, outputs, len(program.graph.nodes))
 
 
 def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterator[tuple[int, float]]:
@@ -277,10 +276,17 @@ def _check_no_history(
         )
 
 
-def _write_onnx(program: torch.export.ExportedProgram, path: Path, exported: Exported, about: dict[str, str]) -> None:
-    names: dict[str, Any] = {"input_names": list(exported.inputs), "output_names": list(exported.outputs)}
+def _write_onnx(
+    program: torch.export.ExportedProgram,
+    path: Path,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    about: dict[str, str],
+) -> None:
     try:
-        written = torch.onnx.export(program, dynamo=True, optimize=True, verbose=False, **names)
+        written = torch.onnx.export(
+            program, dynamo=True, input_names=list(inputs), output_names=list(outputs), optimize=True, verbose=False
+        )
     except Exception as error:
         first: BaseException = error
         while first.__cause__ is not None:
@@ -338,9 +344,14 @@ def _free_axes(small: Tensor, large: Tensor) -> dict[int, Any]:
 
 def _names(paths: list[Any]) -> list[str | None]:
     """A readable name for each path: its field names, with indices only where needed for uniqueness."""
-    # A key prints as .name, ['key'] or [index].
-    parts = [[] if path is None else [(key, str(key).strip(".[]'")) for key in path] for path in paths]
-    short = [".".join(text for key, text in each if not isinstance(key, pytree.SequenceKey)) for each in parts]
-    if len(set(filter(None, short))) < sum(path is not None for path in paths):
-        short = [".".join(text for _, text in each) or "all" for each in parts]
-    return [None if path is None else name for path, name in zip(paths, short, strict=True)]
+    short = [
+        None if path is None else ".".join(_part(key) for key in path if not isinstance(key, pytree.SequenceKey))
+        for path in paths
+    ]
+    if len({name for name in short if name}) == sum(path is not None for path in paths):
+        return short
+    return [None if path is None else ".".join(_part(key) for key in path) or "all" for path in paths]
+
+
+def _part(key: Any) -> str:
+    return str(next(getattr(key, each) for each in ("name", "key", "idx") if hasattr(key, each)))

@@ -6,7 +6,6 @@ import math
 
 from torch import nn
 
-from mcdenoise.errors import InputError
 from mcdenoise.models._interface import Model
 
 
@@ -24,16 +23,11 @@ def frames_remembered(model: Model, tolerance: float) -> int | None:
         The number of frames, 0 for a method without a history; or ``None`` if it is unknown, as for a recurrent
         network or for a user's method without ``persistence``.
 
-    Raises:
-        InputError: the tolerance is out of its range.
-
     Example:
         >>> from mcdenoise.models import create_model
         >>> frames_remembered(create_model("accumulated", alpha_min=0.1), 1e-3)
         66
     """
-    if not 0 < tolerance < 1:
-        raise InputError(f"tolerance: expected in (0, 1), found {tolerance:g}")
     parts = list(model.modules()) if isinstance(model, nn.Module) else [model]
     frames = 0
     for part in parts:

@@ -15,17 +15,13 @@ from mcdenoise.ops._window import accumulator_dtype, parts_of
 CELL, BINS = 8, 32
 
 
-def _check_splat(cell: int, bins: int) -> None:
+def _check_settings(cell: int, bins: int = BINS) -> None:
     check_least(1, cell=cell, bins=bins)
-
-
-def _check_cell(cell: int) -> None:
-    check_least(1, cell=cell)
 
 
 def _check_slice(grid: Tensor, guide: Tensor, cell: int) -> None:
     found, size = tuple(grid.shape[2:4]), tuple(guide.shape[2:])
-    check_least(1, cell=cell, bins=grid.shape[4])
+    _check_settings(cell, grid.shape[4])
     expected = tuple(parts_of(side, cell) for side in size)
     if found != expected:
         raise ValueError(
@@ -33,7 +29,7 @@ def _check_slice(grid: Tensor, guide: Tensor, cell: int) -> None:
         )
 
 
-@op("numba", check=_check_splat, image="B C H W", guide="B 1 H W")
+@op("numba", check=_check_settings, image="B C H W", guide="B 1 H W")
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = CELL, bins: int = BINS) -> tuple[Tensor, Tensor]:
     """Average an image in the cells of a bilateral grid: blocks of pixels, separated by the value of a guide.
 
@@ -161,5 +157,5 @@ def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple
     return index.flatten(1), weight.flatten(1, 3)
 
 
-GridSplat = module_of("GridSplat", grid_splat, _check_splat)
-GridSlice = module_of("GridSlice", grid_slice, _check_cell)
+GridSplat = module_of("GridSplat", grid_splat, _check_settings)
+GridSlice = module_of("GridSlice", grid_slice, _check_settings)
