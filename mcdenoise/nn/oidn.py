@@ -110,9 +110,7 @@ class OidnUNet(nn.Module):
             than bfloat16 resolves.
         """
         height, width = x.shape[-2:]
-        # A graph for any image size cannot branch on whether padding is needed.
-        if torch.compiler.is_compiling() or height % _MULTIPLE or width % _MULTIPLE:
-            x = up_to_multiple(x, _MULTIPLE)
+        x = up_to_multiple(x, _MULTIPLE)
         x = x.to(computing_dtype(x), memory_format=torch.channels_last)
         skips = [x]
         for level, block in enumerate(self.encoder):

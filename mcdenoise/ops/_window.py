@@ -90,7 +90,9 @@ def parts_of(size: int, part: int) -> int:
 def up_to_multiple(image: Tensor, side: int, mode: Literal["constant", "replicate"] = "constant") -> Tensor:
     """``(..., H, W)`` with zeros after it, or its edge repeated, up to whole multiples of ``side``."""
     right, below = (parts_of(size, side) * side - size for size in (image.shape[-1], image.shape[-2]))
-    return F.pad(image, (0, right, 0, below), mode=mode)
+    # A graph for any image size cannot branch on whether padding is needed.
+    padded = torch.compiler.is_compiling() or right or below
+    return F.pad(image, (0, right, 0, below), mode=mode) if padded else image
 
 
 def mirrored(image: Tensor, rows: tuple[int, int], columns: tuple[int, int]) -> Tensor:
