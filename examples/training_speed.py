@@ -51,7 +51,7 @@ def noise(config: TrainConfig) -> ClipSampler:
     shot = {"color": uniform(3), "current": uniform(3), "length": np.ceil(8 * uniform(1)).clip(1)}
     shot |= {"albedo": uniform(3), "normal": 2 * uniform(3) - 1, "depth": 10 * uniform(1), "reference": uniform(3)}
     random = Shot((lambda: shot,), range(config.frames), (config.crop, config.crop), demodulated=True)
-    return ClipSampler([random], config.frames, config.crop)
+    return ClipSampler([random], config)
 
 
 def clips(config: TrainConfig, sequences: list[Path]) -> ClipSampler:

@@ -16,6 +16,7 @@ from mcdenoise.frame import RADIANCE, Frame, Hints, part_of_view
 from mcdenoise.models.with_oidn import NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN
 from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.ops import demodulate
+from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.shots import Array, Shot
 
 _KNOWN = frozenset(field.name for field in fields(Frame))
@@ -86,37 +87,19 @@ class ClipSampler:
     A clip of a shot of one frame has as many parts of it as it has frames: no network is trained on copies.
 
     Args:
-        shots: shots shorter than ``frames`` are skipped, except for stills, which must have references on that frame
-            and shots on as many of their last ``frames``.
-        frames: T, the number of frames of a clip.
-        crop: side of the square crop in pixels.
-        lamps: probability that a clip gets rectangles of constant radiance without noise, up to 30 times as bright as
-            its mean: directly visible emitters, which few training scenes have.
-        key: typical radiance to which each clip is first scaled, see :func:`mcdenoise.nn.inputs.auto_exposure`; 0 does
-            not scale.
-        exposure: the light of a clip is scaled by up to this many stops, up or down.
-        tint: each color channel of the light is scaled by up to this many stops, up or down.
+        shots: shots shorter than a clip are skipped, except for stills, which must have references on that frame and
+            shots on as many of their last ones.
+        config: says how long and wide a clip is, and how its light is changed: ``frames``, ``crop``, ``lamps``,
+            ``key``, ``exposure`` and ``tint``. A lamp is up to 30 times as bright as the clip's mean.
 
     Raises:
         InputError: no shot is long enough, one is smaller than the crop, or clips differ in their number of references.
     """
 
-    def __init__(
-        self,
-        shots: Iterable[Shot],
-        frames: int,
-        crop: int,
-        *,
-        lamps: float = 0.0,
-        key: float = 0.0,
-        exposure: float = 0.0,
-        tint: float = 0.0,
-    ) -> None:
-        self.shots = [shot for shot in shots if _is_enough(len(shot), frames)]
-        self.frames, self.crop = frames, crop
-        self.lamps, self.key, self.exposure, self.tint = lamps, key, exposure, tint
-        check_sizes([(len(shot), shot.references, shot.size) for shot in self.shots], frames, crop)
-        self.chances = torch.tensor([float(max(len(shot), frames)) for shot in self.shots])
+    def __init__(self, shots: Iterable[Shot], config: TrainConfig) -> None:
+        self.config, self.shots = config, [shot for shot in shots if _is_enough(len(shot), config.frames)]
+        check_sizes([(len(shot), shot.references, shot.size) for shot in self.shots], config.frames, config.crop)
+        self.chances = torch.tensor([float(max(len(shot), config.frames)) for shot in self.shots])
 
     def draw(self, seeds: Sequence[int]) -> Clip:
         """Draw a clip for each seed; the probability of a shot is proportional to its number of frames."""
@@ -126,19 +109,19 @@ class ClipSampler:
             for seed in seeds:
                 torch.default_generator.manual_seed(seed)
                 shot = self.shots[int(torch.multinomial(self.chances, 1))]
-                parts = [self._draw_one(shot) for _ in range(self.frames if len(shot) == 1 else 1)]
+                parts = [self._draw_one(shot) for _ in range(self.config.frames if len(shot) == 1 else 1)]
                 drawn.append({name: torch.cat([part[name] for part in parts]) for name in parts[0]})
         return Clip({name: torch.stack([clip[name] for clip in drawn]) for name in drawn[0]})
 
     def _draw_one(self, shot: Shot) -> dict[str, Tensor]:
-        height, width = shot.size
-        frames = min(self.frames, len(shot))
+        (height, width), config = shot.size, self.config
+        frames = min(config.frames, len(shot))
         first = 0 if shot.references == len(shot) else len(shot) - frames
         noise_seed, start = _randint(shot.noise_seeds), first + _randint(len(shot) - frames + 1 - first)
-        top, left = _randint(height - self.crop + 1), _randint(width - self.crop + 1)
+        top, left = _randint(height - config.crop + 1), _randint(width - config.crop + 1)
         order, axes = torch.randperm(3).tolist(), torch.randperm(3).tolist()
         turn = _Turn(_randint(4), bool(_randint(2)))
-        rows, columns = slice(top, top + self.crop), slice(left, left + self.crop)
+        rows, columns = slice(top, top + config.crop), slice(left, left + config.crop)
         clip = shot.read(
             slice(start, start + frames),
             rows,
@@ -157,12 +140,12 @@ class ClipSampler:
             view[:, :3] = view[:, axes] * signs.reshape(3, 1)
             view[..., :2] = turn.vectors(view[..., :2].mT).mT
             clip["view_projection"] = view
-        stops = self.exposure * (2 * torch.rand(1) - 1) + self.tint * (2 * torch.rand(3) - 1)
+        stops = config.exposure * (2 * torch.rand(1) - 1) + config.tint * (2 * torch.rand(3) - 1)
         factor = torch.exp2(stops).reshape(3, 1, 1)
-        if self.key:
-            factor = factor * auto_exposure(clip["reference"][:1], self.key)[0]
+        if config.key:
+            factor = factor * auto_exposure(clip["reference"][:1], config.key)[0]
         _light(clip, factor)
-        if self.lamps and float(torch.rand(())) < self.lamps:
+        if config.lamps and float(torch.rand(())) < config.lamps:
             mean = clip["reference"].mean()
             for _ in range(1 + _randint(3)):
                 self._hang_lamp(clip, mean, demodulated=shot.demodulated)
@@ -170,8 +153,9 @@ class ClipSampler:
 
     def _hang_lamp(self, clip: dict[str, Tensor], mean: Tensor, *, demodulated: bool) -> None:
         """Paint a rectangle of constant radiance in all frames, with or without albedo."""
-        height, width = 2 + _randint(self.crop // 3), 2 + _randint(self.crop // 3)
-        top, left = _randint(self.crop - height), _randint(self.crop - width)
+        crop = self.config.crop
+        height, width = 2 + _randint(crop // 3), 2 + _randint(crop // 3)
+        top, left = _randint(crop - height), _randint(crop - width)
         tint = 0.7 + 0.6 * torch.rand(1, 3, 1, 1)
         radiance = mean * 30 ** torch.rand(()) * tint
         albedo = torch.rand(1, 1, 1, 1).expand(1, 3, 1, 1) * _randint(2)

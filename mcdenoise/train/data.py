@@ -108,9 +108,7 @@ class TrainingData:
                 description.setdefault("validation_sequences", []).append(_describe(source, digest))
         for name, shards in {"packed": takes, "packed_validation": watched_takes}.items():
             description |= {name: describe_takes(shards)} if shards else {}
-        light = {"key": config.key, "exposure": config.exposure, "tint": config.tint}
-        sampler = ClipSampler(shots, config.frames, config.crop, lamps=config.lamps, **light)
-        return TrainingData(sampler, watched, description)
+        return TrainingData(ClipSampler(shots, config), watched, description)
 
 
 def _doubts(sources: list[Source], used: frozenset[str], kept: int, *, accumulates: bool) -> Iterator[str]:

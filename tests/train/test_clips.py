@@ -5,6 +5,7 @@ from torch import Tensor
 
 from mcdenoise.ops import motion_from_position
 from mcdenoise.train.clips import Clip, ClipSampler
+from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.front import ACCUMULATED
 from mcdenoise.train.shots import Shot
 
@@ -52,7 +53,7 @@ def test_clips_are_the_shot_turned_and_renamed() -> None:
         for place, window in windows.items()
         for orientation, turned in enumerate(orbit(window))
     ]
-    sampler = ClipSampler([shot_of(shot)], frames, crop)
+    sampler = ClipSampler([shot_of(shot)], TrainConfig(frames=frames, crop=crop))
     places, orientations, orders = set(), set(), set()
     for seed in range(96):
         drawn = sampler.draw([seed])
@@ -81,7 +82,9 @@ def test_clips_are_the_shot_turned_and_renamed() -> None:
 
 
 def test_a_clip_depends_on_its_seed_alone() -> None:
-    sampler = ClipSampler([shot_of(numbered()), shot_of(numbered(4))], 2, 4, lamps=0.5, exposure=1.0, tint=1.0)
+    sampler = ClipSampler(
+        [shot_of(numbered()), shot_of(numbered(4))], TrainConfig(frames=2, crop=4, lamps=0.5, exposure=1.0, tint=1.0)
+    )
     torch.manual_seed(1)
     before = torch.random.get_rng_state()
     batch = sampler.draw([7, 8, 9])
@@ -99,8 +102,8 @@ def test_exposure_scales_light_and_nothing_else() -> None:
     """Light is linear: noisy color and reference of a clip grow by one factor, within the limit."""
     stack = numbered()
     seeds = list(range(40))
-    plain = ClipSampler([shot_of(stack)], 2, 4).draw(seeds)
-    lit = ClipSampler([shot_of(stack)], 2, 4, exposure=2.0).draw(seeds)
+    plain = ClipSampler([shot_of(stack)], TrainConfig(frames=2, crop=4)).draw(seeds)
+    lit = ClipSampler([shot_of(stack)], TrainConfig(frames=2, crop=4, exposure=2.0)).draw(seeds)
     for name in ("length", "albedo", "normal", "depth"):
         assert torch.equal(lit[name], plain[name]), name
     factors = (lit["color"] / plain["color"])[:, :1, :1, :1, :1]
@@ -126,7 +129,7 @@ def test_motion_is_flipped_and_turned_with_the_image() -> None:
     motion[1, :, 4, 4] = torch.inf
     features = {"motion": motion, "depth": depth, "reference": torch.ones(2, 3, size, size)}
     features["color"] = features["reference"]
-    clip = ClipSampler([in_memory(features)], 2, size).draw(list(range(40)))
+    clip = ClipSampler([in_memory(features)], TrainConfig(frames=2, crop=size)).draw(list(range(40)))
     views = {tuple(view[0, 0].flatten().tolist()) for view in clip["depth"]}
     assert len(views) == 8
     for numbers, vectors in zip(clip["depth"][:, :, 0], clip["motion"][:, 1], strict=True):
@@ -148,7 +151,7 @@ def test_the_camera_sees_the_crop_as_the_motion_has_it() -> None:
     motion = torch.stack([motion_from_position(position[t : t + 1], views[max(t - 1, 0)][None])[0] for t in range(3)])
     features = {"position": position, "motion": motion, "view_projection": views}
     features["color"] = features["reference"] = torch.ones(3, 3, height, width)
-    clip = ClipSampler([in_memory(features)], 3, crop).draw(list(range(40)))
+    clip = ClipSampler([in_memory(features)], TrainConfig(frames=3, crop=crop)).draw(list(range(40)))
     found = motion_from_position(clip["position"][:, 1].contiguous(), clip["view_projection"][:, 0].contiguous())
     # Pixel coordinates of some 100, of which float32 knows 1e-5; measured: 2e-5.
     torch.testing.assert_close(found, clip["motion"][:, 1], rtol=1e-4, atol=2e-4)

@@ -21,6 +21,7 @@ from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Output, create_model
 from mcdenoise.ops import motion_from_position
 from mcdenoise.train.clips import ClipSampler
+from mcdenoise.train.config import TrainConfig
 from mcdenoise.train.footage import features_of, shots_of
 from mcdenoise.train.front import Front
 from mcdenoise.train.shots import Shot
@@ -321,10 +322,10 @@ def test_without_a_history_all_frames_are_handed(tmp_path: Path) -> None:
 def test_a_clip_of_a_still_has_as_many_parts_of_it(front: Front, tmp_path: Path) -> None:
     sources = take(tmp_path, 1, 1), take(tmp_path, 8, 3)
     shots = [shot for source in sources for shot in shots_of(source, front, ALBEDO, 3, tmp_path / "cache")[0]]
-    clip = ClipSampler([shots[0]], 3, 8).draw([1, 2])
+    clip = ClipSampler([shots[0]], TrainConfig(frames=3, crop=8)).draw([1, 2])
     assert clip["color"].shape == clip["reference"].shape == (2, 3, 3, 8, 8)
     assert not torch.equal(clip["color"][:, 0], clip["color"][:, 1])
-    assert ClipSampler(shots, 3, 8).draw(range(6))["color"].shape == (6, 3, 3, 8, 8)
+    assert ClipSampler(shots, TrainConfig(frames=3, crop=8)).draw(range(6))["color"].shape == (6, 3, 3, 8, 8)
 
 
 @pytest.mark.parametrize("front", [Front(), HISTORY], ids=["alone", "accumulated"])
