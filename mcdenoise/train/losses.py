@@ -36,15 +36,20 @@ def stage_loss(
 ) -> Tensor:
     """The total loss: for the image and for an intermediate one, errors in space and time, and errors on a display.
 
-    ``L = sum_s (L_c(R_s, Y) + w_d L_d(R_s, Y))`` over the result and the stage ``initial``, if there is one, with the
-    loss ``L_c`` of a clip; with ``L_c`` of :func:`smape_loss` and without ``w_d``, that is the paper's.
+    ``L = sum_s (L_c(R_s, Y) + w_d L_d(R_s, Y))`` over the result and the stage ``initial``, if there is one. The loss
+    ``L_c`` of a clip is one of these, with the temporal SMAPE ``L_t``:
+
+    - ``"smape"``, with ``w_d = 0`` the paper's: ``SMAPE(R, Y) + w_t L_t``;
+    - ``"l1_display"``: ``mean |g(R) - g(Y)| + w_t L_t`` with ``g(x) = (max(x, 0) + 0.001)^(1 / 2.2) + min(x, 0)``,
+      which gives bright pixels less weight than dark ones, and unlike :func:`display_error` has no upper limit. Meng
+      et al. 2020 train without the 0.001, negative light and ``L_t``;
+    - ``"rae"``: :func:`rae_loss`.
 
     Args:
         output: output for a clip: images ``(B, T, 3, H, W)``, scene-linear radiance including albedo.
         reference: Y, the same shape, or that of its last frames only, which are then the clip.
-        loss: a name in :data:`LOSSES`: ``"smape"``, :func:`smape_loss`; ``"l1_display"``, :func:`l1_display_loss`; or
-            ``"rae"``, :func:`rae_loss`.
-        temporal_weight: ``w_t`` of these, the paper's ``w_c = w_d``, 0.1; 0 disables the temporal loss.
+        loss: the name of ``L_c``.
+        temporal_weight: ``w_t``, the paper's ``w_c = w_d``, 0.1; 0 disables the temporal loss.
         display_weight: ``w_d`` of :func:`display_error`; 0, as in the paper, disables it.
 
     Returns:
@@ -53,7 +58,7 @@ def stage_loss(
     Raises:
         ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
 
-    Differentiable in all images.
+    Differentiable in all images; ``"l1_display"`` where they differ, also in black and below.
 
     Source: the paper's Eqs. 9-11, with ``w_a = w_b = 1``.
 
@@ -66,51 +71,24 @@ def stage_loss(
     total = reference.new_zeros(())
     for image in seen_stages(output).values():
         clip = image[:, -reference.shape[1] :]
-        total = total + LOSSES[loss](clip, reference, temporal_weight=temporal_weight)
+        total = total + LOSSES[loss](clip, reference, temporal_weight)
         if display_weight:
             total = total + display_weight * display_error(clip, reference).mean()
     return total
 
 
-def smape_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
-    """Spatial and temporal SMAPE of clips, the paper's Eqs. 9 and 10: ``L_s(R, Y) + w_t L_t(dR, dY)``.
-
-    Args:
-        image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
-        reference: Y, the same shape.
-        temporal_weight: ``w_t``; 0 disables the temporal loss.
-
-    Returns:
-        A scalar, the mean over the batch.
-
-    Raises:
-        ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
-    """
-    spatial = smape_linear(image, reference).mean()
-    return spatial + temporal_weight * temporal_smape_linear(image, reference).mean() if temporal_weight else spatial
+def _smape(image: Tensor, reference: Tensor, temporal_weight: float) -> Tensor:
+    return smape_linear(image, reference).mean() + _of_changes(image, reference, temporal_weight)
 
 
-def l1_display_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
-    """Mean absolute difference of gamma-mapped radiance, which gives bright pixels less weight than dark ones.
-
-    ``L = mean |g(R) - g(Y)| + w_t L_t(dR, dY)`` with ``g(x) = (max(x, 0) + c)^(1 / 2.2) + min(x, 0)`` and
-    ``c = 0.001``. Meng et al. 2020 train without ``c``, negative light and ``L_t``. Unlike :func:`display_error` it has
-    no upper limit.
-
-    Args:
-        image: R, ``(B, T, 3, H, W)`` scene-linear radiance.
-        reference: Y, the same shape.
-        temporal_weight: ``w_t`` of the temporal SMAPE; 0 disables it.
-
-    Returns:
-        A scalar, the mean over the batch, differentiable where both images differ, also in black and below.
-
-    Raises:
-        ValueError: the shapes differ, or a temporal loss is requested for clips of one frame.
-    """
+def _l1_display(image: Tensor, reference: Tensor, temporal_weight: float) -> Tensor:
     check_images(image, reference)
-    spatial = (_shown(image) - _shown(reference)).abs().mean()
-    return spatial + temporal_weight * temporal_smape_linear(image, reference).mean() if temporal_weight else spatial
+    return (_shown(image) - _shown(reference)).abs().mean() + _of_changes(image, reference, temporal_weight)
+
+
+def _of_changes(image: Tensor, reference: Tensor, weight: float) -> Tensor | float:
+    """``w_t L_t``, of clips of several frames, unless the weight is 0."""
+    return weight * temporal_smape_linear(image, reference).mean() if weight else 0.0
 
 
 def _shown(image: Tensor) -> Tensor:
@@ -118,7 +96,7 @@ def _shown(image: Tensor) -> Tensor:
     return image.clamp_min(0).add(_DARK).pow(1 / 2.2) + torch.where(image < 0, image, 0)
 
 
-def rae_loss(image: Tensor, reference: Tensor, *, temporal_weight: float = 0.1) -> Tensor:
+def rae_loss(image: Tensor, reference: Tensor, temporal_weight: float = 0.1) -> Tensor:
     """L1 of values, of gradients and of temporal differences, with larger weights for later frames of a clip.
 
     ``L = sum_t g_t (0.8 L_s + 0.1 L_g + w_t L_t) / sum_t g_t``, with ``P = log(1 + R)`` (R where that is negative) and
@@ -180,9 +158,9 @@ def _by_frame(error: Tensor) -> Tensor:
 
 
 # Losses of a clip by name.
-LOSSES: dict[str, Callable[..., Tensor]] = {
-    "smape": smape_loss,
-    "l1_display": l1_display_loss,
+LOSSES: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
+    "smape": _smape,
+    "l1_display": _l1_display,
     "rae": rae_loss,
 }
 
