@@ -26,10 +26,11 @@ from mcdenoise.data.camera_path import Camera, view_projection
 from mcdenoise.data.exr import read_exr
 from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.assets import Mesh as Triangles
-from mcdenoise.scenes.cycles import Blender, render_cycles, translate
+from mcdenoise.scenes.cycles import Blender, render_cycles
 from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, buffers_of
 from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
+from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.random.builder import place, rgb, rotate
 from mcdenoise.scenes.render import Film
 from mcdenoise.scenes.takes.draw import Take, draw_take
@@ -273,7 +274,7 @@ def blender() -> Iterator[Blender]:
 
 
 def rendered(blender: Blender, folder: Path, scene: dict[str, Any], camera: Camera = CAMERA, **options: Any) -> Any:
-    options = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 64, **options}
+    options = {"size": (24, 16), "noise_seeds": 1, "reference_spp": 64, **options}
     return open_sequence(render_cycles(take_of(scene, [camera]), folder, blender, **options)).frame(0)
 
 
@@ -306,7 +307,7 @@ def test_parts_add_up_to_each_noisy_color(blender: Blender, tmp_path: Path) -> N
     shiny = {"type": "roughconductor", "material": "Ag", "alpha": 0.1}
     scene = scene_of(ball=ball(shiny), sky={"type": "constant", "radiance": 2.0}) | floor()
     made = take_of(scene, [CAMERA])
-    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 0}
+    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_spp": 0}
     render_cycles(made, tmp_path, blender, **options)
     before = pixels(tmp_path)
     # Buffers that are requested later are added, and the noise stays the same.
@@ -409,16 +410,16 @@ def test_a_sequence_is_resumed_to_the_same_pixels(blender: Blender, tmp_path: Pa
     drawn = draw_take(4, Assets(), frames=2, stills=False)
     assert drawn.moves.keys() - {"sky"}
     made = replace(drawn, film=Film("gaussian"))
-    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_samples": 8, "seed": 5}
-    options |= {"samples": 2, "shutter": 0.0}
+    options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 2, "reference_spp": 8, "seed": 5}
+    options |= {"spp": 2, "shutter": 0.0, "reference_frames": [1]}
     seen: list[tuple[int, int]] = []
     folder = render_cycles(made, tmp_path, blender, **options, progress=lambda *each: seen.append(each))
-    assert seen[0] == (0, 2 * (2 * 2 + 8))
-    assert seen[-1] == (24, 24)
+    assert seen[0] == (0, 2 * 2 * 2 + 8)
+    assert seen[-1] == (16, 16)
     before = pixels(folder)
     sequence = open_sequence(tmp_path)
-    assert sequence.noise_seeds == 2
-    assert {"previous_position", "reference", "view_projection"} <= sequence.buffers
+    assert (sequence.noise_seeds, sequence.reference_numbers) == (2, [1])
+    assert {"previous_position", "view_projection"} <= sequence.buffers
     # Through a filter each noisy color has samples of its own, and so have its features; but for what Cycles takes from
     # the first sample alone, which it puts at the pixel centre.
     for name in ("color", "albedo", "shading_normal", "world_position", "depth", "previous_position"):
@@ -441,7 +442,7 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     spread = []
     for aperture in (0.0, 1.0):
         take = take_of(scene, [CAMERA], film=Film("centre", aperture, focus=24.0))
-        options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_samples": 0, "shutter": 0.0}
+        options: dict[str, Any] = {"size": (24, 16), "noise_seeds": 1, "reference_spp": 0, "shutter": 0.0}
         frame = open_sequence(render_cycles(take, tmp_path / f"{aperture}", blender, **options)).frame(0)
         near = image(frame.depth)[..., 0] < 10
         spread.append(np.unique(np.nonzero(near)[1]).size)
@@ -457,6 +458,6 @@ def test_lens_and_shutter_blur(blender: Blender, tmp_path: Path) -> None:
     assert spread[0] <= 2 < spread[1]
 
 
-@pytest.mark.parametrize("option", ["samples", "noise_seeds", "reference_samples", "threads", "seed"])
+@pytest.mark.parametrize("option", ["spp", "noise_seeds", "reference_spp", "threads", "seed"])
 def test_numbers_below_the_least_are_told(blender: Blender, tmp_path: Path, option: str) -> None:
     assert f"{option}:" in refused(render_cycles, take_of(scene_of(), [CAMERA]), tmp_path, blender, **{option: -1})

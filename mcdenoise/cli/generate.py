@@ -76,7 +76,7 @@ def generate(
     if takes and renderer == "cycles":
         raise InputError("--takes: expected --renderer mitsuba, found cycles")
     chosen, workers = parse_frames(seeds, name="--seeds"), parse_workers(rendering.workers)
-    arguments = {**rendering.arguments(), "workers": workers or 1}
+    arguments = rendering.arguments()
     # One variant for all machines, because it is part of the identity of a sequence.
     variant = None if renderer == "cycles" else choose_variant(rendering.variant)
     common: dict[str, Any] = {"out": Path(os.path.abspath(out)), "unseen": unseen}
@@ -85,9 +85,8 @@ def generate(
     if takes:
         plan = TakePlan(**common, variant=str(variant), plain=plain, **_of_takes(rendering, frames))
     else:
-        arguments |= {"variant": variant}
-        common |= {"frames": frames or _FRAMES}
-        plan = SequencePlan(**common, rendering=arguments, cycles=renderer == "cycles", parts=parts)
+        common |= {"frames": frames or _FRAMES, "rendering": {**arguments, "variant": variant}}
+        plan = SequencePlan(**common, cycles=renderer == "cycles", parts=parts)
     with progress_bar() as progress:
         scenes = progress.add_task("takes" if takes else "scenes", total=len(chosen))
 

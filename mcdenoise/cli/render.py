@@ -42,17 +42,12 @@ class RenderOptions:
 
     def arguments(self) -> dict[str, Any]:
         """Those of ``render_sequence``."""
-        if self.reference_spp < 0:
-            raise InputError(f"--reference-spp: expected at least 0, found {self.reference_spp}")
         frames = self.reference_frames
-        referenced = None if frames is None else parse_frames(frames, name="--reference-frames")
         return {
-            "spp": self.spp,
-            "noise_seeds": self.noise_seeds,
-            "reference_spp": max(self.reference_spp, 1),
-            "reference_frames": referenced if self.reference_spp > 0 else [],
+            **vars(self),
+            "reference_frames": None if frames is None else parse_frames(frames, name="--reference-frames"),
             "size": parse_size(self.size),
-            "variant": self.variant,
+            "workers": parse_workers(self.workers) or 1,
         }
 
 
@@ -87,10 +82,10 @@ def render(
     """
     if every < 1:
         raise InputError(f"--every: expected at least 1, found {every}")
-    arguments, workers = rendering.arguments(), parse_workers(rendering.workers)
+    arguments = rendering.arguments()
     shot = load_camera_path(camera_path)
     engine = None
-    if workers is None:
+    if parse_workers(rendering.workers) is None:
         # Workers have other working folders.
         scene, out = Path(os.path.abspath(scene)), Path(os.path.abspath(out))
         arguments["variant"] = choose_variant(rendering.variant)
@@ -106,7 +101,6 @@ def render(
             seed=seed,
             noise_level=noise_level,
             keep_samples=keep_samples,
-            workers=workers or 1,
             progress=on_step,
             **arguments,
         )

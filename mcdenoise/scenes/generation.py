@@ -22,7 +22,7 @@ class SequencePlan(Plan):
 
     Args:
         rendering: arguments of :func:`mcdenoise.scenes.render.render_sequence`, its variant among them.
-        cycles: whether Cycles renders them, else Mitsuba.
+        cycles: whether Cycles renders them, which has no use for workers and variant, else Mitsuba.
         parts: whether Cycles writes diffuse and specular light, too.
     """
 
@@ -32,35 +32,21 @@ class SequencePlan(Plan):
 
     def render(self, number: int, progress: Callable[[int, int], None] | None = None) -> Path:
         """Render the sequence of a number."""
-        out = self.out / f"random{number:04d}"
-        rendering = self.rendering
+        out, rendering = self.out / f"random{number:04d}", dict(self.rendering, seed=number, progress=progress)
         width, height = (max(side, 1) for side in rendering["size"])
         if self.cycles:
             # What a place shows is not decided, because that needs Mitsuba.
             take = next(self.draws(number, size=(width, height), stills=False))
+            del rendering["workers"], rendering["variant"]
             with Blender() as blender:
-                folder = render_cycles(
-                    take,
-                    out,
-                    blender,
-                    size=rendering["size"],
-                    seed=number,
-                    samples=rendering["spp"],
-                    noise_seeds=rendering["noise_seeds"],
-                    reference_samples=rendering["reference_spp"] if rendering["reference_frames"] != [] else 0,
-                    parts=self.parts,
-                    threads=self.threads,
-                    progress=progress,
-                )
+                folder = render_cycles(take, out, blender, parts=self.parts, threads=self.threads, **rendering)
         else:
             # Clips that are sampled once at pixel centres, to see what they show.
             size = _PROBED, max(1, _PROBED * height // width)
             tracer, _ = self.first_worth(number, rendering["variant"], size=size, stills=False, plain=True)
             take = tracer.take
             tracer.release()
-            folder = render_sequence(
-                take.scene, take.cameras, out, moves=take.moves, seed=number, progress=progress, **rendering
-            )
+            folder = render_sequence(take.scene, take.cameras, out, moves=take.moves, **rendering)
         if take.credits:
             write_text(out / "credits.txt", "\n".join((*take.credits, "")))
         return folder

@@ -5,6 +5,5 @@ Blender is optional: a separate process, with a Python that has the module ``bpy
 
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.sequence import render_cycles
-from mcdenoise.scenes.cycles.translate import Description, translate
 
-__all__ = ["Blender", "Description", "render_cycles", "translate"]
+__all__ = ["Blender", "render_cycles"]

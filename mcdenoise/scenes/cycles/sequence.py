@@ -11,7 +11,7 @@ the filter: they are noisy only through lens and shutter, and an image of one sa
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.render.folder import SequenceFolder, write_reference
 from mcdenoise.scenes.render.halves import ReferenceState
-from mcdenoise.scenes.render.sequence import check_lowest
+from mcdenoise.scenes.render.sequence import check_lowest, wanted_references
 from mcdenoise.scenes.render.stage import to_previous
 from mcdenoise.scenes.takes.draw import Take
 
@@ -66,9 +66,10 @@ def render_cycles(
     *,
     size: tuple[int, int] = (160, 160),
     seed: int = 0,
-    samples: int = 1,
+    spp: int = 1,
     noise_seeds: int = 2,
-    reference_samples: int = 128,
+    reference_spp: int = 128,
+    reference_frames: Collection[int] | None = None,
     shutter: float | None = None,
     parts: bool = False,
     threads: int = 0,
@@ -84,11 +85,12 @@ def render_cycles(
         blender: the rendering process.
         size: width and height in pixels.
         seed: seed of the noise, and of the shutter.
-        samples: samples per pixel of the noisy colors.
+        spp: samples per pixel of the noisy colors.
         noise_seeds: number of noise seeds, each with its own color and features. Those after the first are written to
             ``out/inputs/noise_seed{1,2,...}``.
-        reference_samples: samples per pixel of the references, but at least four times as many as of the noisy colors;
-            0 for no references.
+        reference_spp: samples per pixel of the references, but at least four times as many as of the noisy colors; 0
+            for no references.
+        reference_frames: numbers of the frames that get a reference; all by default.
         shutter: exposure time in frames; by default 0 for stills and most clips, and a half for some.
         parts: also write the diffuse and the specular light of the noisy colors, see
             :mod:`mcdenoise.data.readers.diffuse_specular`.
@@ -102,15 +104,16 @@ def render_cycles(
         InputError: a setting is invalid, Cycles does not support a part of the scene, Blender failed, or ``out`` cannot
             be written or holds a sequence with other settings.
     """
-    check_lowest(1, samples=samples, noise_seeds=noise_seeds)
-    check_lowest(0, reference_samples=reference_samples, threads=threads, seed=seed)
+    check_lowest(1, spp=spp, noise_seeds=noise_seeds)
+    check_lowest(0, reference_spp=reference_spp, threads=threads, seed=seed)
     count = len(take.cameras)
+    references = wanted_references(count, reference_spp, reference_frames)
     if shutter is None:
         blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
         shutter = _SHUTTER if blurred and count > 1 else 0.0
     used = take.film.filter if take.film.filter in _WIDTHS else _DEFAULT_FILTER
     settings = {"filter": used, "aperture": take.film.aperture, "focus": take.film.focus, "shutter": shutter}
-    clean_samples = max(reference_samples, _CLEANER * samples) if reference_samples else 0
+    clean_spp = max(reference_spp, _CLEANER * spp)
     # The sky stands still in Cycles.
     moves = check_moves({name: path for name, path in take.moves.items() if name != "sky"}, count)
     # Sorted, so that Blender's index of an object identifies it.
@@ -126,7 +129,7 @@ def render_cycles(
         moves,
         _CONVENTIONS,
         renderer=f"Blender {blender.version}, Cycles",
-        noisy_spp=samples,
+        noisy_spp=spp,
         film=dict(settings),
         noise_seeds=noise_seeds,
         seed=seed,
@@ -135,9 +138,9 @@ def render_cycles(
     names = (*_FEATURES, *(["specular"] if parts else []), "color")
     seeds = {k: noise_seed_folder(folder.path, k) for k in reversed(range(noise_seeds))}
     noisy = [(n, k) for n in range(count) for k, own in seeds.items() if not has_buffers(own, n, names, size)]
-    clean = [n for n in range(count) if clean_samples and n not in folder.references]
-    total = count * (noise_seeds * samples + clean_samples)
-    done = total - len(noisy) * samples - len(clean) * clean_samples
+    clean = sorted(references - folder.references.keys())
+    total = count * noise_seeds * spp + len(references) * clean_spp
+    done = total - len(noisy) * spp - len(clean) * clean_spp
 
     def advance(spent: int) -> None:
         nonlocal done
@@ -169,12 +172,12 @@ def render_cycles(
         # number of samples so far, and the noise of a frame must not depend on previous renderings.
         for number, noise_seed in noisy:
             back = {index + 1: to_previous(moves[name], number) for index, name in enumerate(movers)}
-            found = shot(number, samples, 1 + noise_seed if noise_seed else 0, back)
+            found = shot(number, spp, 1 + noise_seed if noise_seed else 0, back)
             write_buffers(seeds[noise_seed], number, found)
         for number in clean:
-            found = shot(number, clean_samples, _REFERENCE_STREAM, {})
+            found = shot(number, clean_spp, _REFERENCE_STREAM, {})
             write_buffers(folder.path / CLEAN, number, {name: found[name] for name in ("albedo", "normal")})
-            state = ReferenceState(clean_samples, 1, None)
+            state = ReferenceState(clean_spp, 1, None)
             write_reference(folder.path, number, found["color"], state)
             folder.note_reference(number, state)
     return folder.path

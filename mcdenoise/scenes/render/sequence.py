@@ -67,7 +67,7 @@ def render_sequence(
         spp: paths per pixel of the noisy colour.
         noise_seeds: number of noise seeds, that is, of independent noisy colours per frame. Those after the first are
             written to ``out/inputs/noise_seed{1,2,...}``.
-        reference_spp: paths per pixel of the references; with ``noise_level`` the maximum.
+        reference_spp: paths per pixel of the references, 0 for none; with ``noise_level`` the maximum.
         noise_level: a reference is finished early when its estimated SMAPE against the truth is this small; see
             :class:`mcdenoise.scenes.render.halves.ReferenceHalves`. ``camera.json`` records the noise of each frame.
         reference_frames: numbers of the frames that get a reference; all by default.
@@ -101,10 +101,10 @@ def render_sequence(
     cameras = list(cameras)
     checked_moves = check_moves(moves or {}, len(cameras))
     count = len(cameras) if frames is None else min(frames, len(cameras))
-    references = frozenset(range(count) if reference_frames is None else reference_frames)
-    _check_settings(size, count, references, noise_level)
-    check_lowest(1, spp=spp, noise_seeds=noise_seeds, reference_spp=reference_spp, max_depth=max_depth, workers=workers)
-    check_lowest(0, seed=seed)
+    references = wanted_references(count, reference_spp, reference_frames)
+    _check_settings(size, count, noise_level)
+    check_lowest(1, spp=spp, noise_seeds=noise_seeds, max_depth=max_depth, workers=workers)
+    check_lowest(0, seed=seed, reference_spp=reference_spp)
     variant = choose_variant(variant)
     if workers > 1 and engine is None:
         engine = LocalEngine(workers)
@@ -185,16 +185,25 @@ def render_sequence(
     return folder.path
 
 
-def _check_settings(size: tuple[int, int], count: int, references: frozenset[int], noise_level: float | None) -> None:
+def wanted_references(count: int, reference_spp: int, numbers: Collection[int] | None) -> frozenset[int]:
+    """The frames that get a reference, see :func:`render_sequence`.
+
+    Raises:
+        InputError: one of the numbers is not that of a frame.
+    """
+    references = frozenset(() if not reference_spp else range(count) if numbers is None else numbers)
+    if outside := sorted(number for number in references if not 0 <= number < count):
+        raise InputError(f"reference frames: expected numbers from 0 to {count - 1}, found {outside[0]}")
+    return references
+
+
+def _check_settings(size: tuple[int, int], count: int, noise_level: float | None) -> None:
     if count < 1:
         raise InputError("expected at least one camera and one frame to render, found none")
     if not all(isinstance(side, int) and 1 <= side <= _LARGEST_SIDE for side in size):
         raise InputError(
             f"size: expected width and height between 1 and {_LARGEST_SIDE} pixels, found {size[0]}x{size[1]}"
         )
-    outside = sorted(number for number in references if not 0 <= number < count)
-    if outside:
-        raise InputError(f"reference frames: expected numbers from 0 to {count - 1}, found {outside[0]}")
     if noise_level is not None and not 0 < noise_level < 1:
         raise InputError(f"noise_level: expected more than 0 and less than 1, found {noise_level:g}")
 
