@@ -179,13 +179,12 @@ def default_folder() -> Path:
     return cache_file("assets")
 
 
-def open_assets(folder: Path, say: Callable[[str], None], fetch: bool = True) -> Assets:
+def open_assets(folder: Path, say: Callable[[str], None]) -> Assets:
     """The assets in a folder; packages that are not there are fetched, and one line says what is missing.
 
     Args:
         folder: created if necessary.
         say: shows one line.
-        fetch: whether to start the packages' clients.
 
     Raises:
         InputError: the folder cannot be written, or an archive in it is damaged.
@@ -193,7 +192,7 @@ def open_assets(folder: Path, say: Callable[[str], None], fetch: bool = True) ->
     make_folder(folder)
     furniture, images = folder / _FURNITURE, folder / "images"
     for target, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):
-        if target.is_dir() or not fetch:
+        if target.is_dir():
             continue
         try:
             with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work:
@@ -363,10 +362,7 @@ def _triangles(
         return None
     flat = [corner for triangle in corners for corner in triangle]
     names = {name: number for number, name in enumerate(dict.fromkeys(flat))}
-    index = np.zeros((len(names), 3), np.int64)
-    for name, number in names.items():
-        for k, part in enumerate(name.split("/")[:3]):
-            index[number, k] = int(part) if part else 0
+    index = np.array([[int(part or 0) for part in f"{name}//".split("/")[:3]] for name in names], np.int64)
     counts = np.array([len(vertices), len(uv), len(normals)])
     # Positive numbers count from 1, negative ones from the end; 0 stands for none.
     index = np.where(index < 0, index + counts, index - 1)

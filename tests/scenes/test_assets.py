@@ -59,7 +59,7 @@ def folder_with(tmp_path: Path, members: dict[str, str]) -> Path:
 def opened(tmp_path: Path, **members: str) -> Model:
     content = {"PluginFurnitureCatalog.properties": CATALOGUE, "scopia/box/box.obj": BOX.format(mtl="box.mtl")}
     content |= {"scopia/box/box.mtl": MTL} | {f"scopia/box/{name}.obj": text for name, text in members.items()}
-    (model,) = open_assets(folder_with(tmp_path, content), lambda line: None, fetch=False).models
+    (model,) = open_assets(folder_with(tmp_path, content), lambda line: None).models
     return model
 
 
