@@ -187,17 +187,14 @@ def _render_missing(
 
 def _write_reference(path: Path, parts: list[Path], samples: int) -> float:
     """Write the mean of the parts, and return the estimate of its noise."""
-    halves: ReferenceHalves | None = None
+    images = []
     for part in parts:
         pixels, channels, _ = read_exr(part)
-        chosen = [index for index, name in enumerate(channels) if name.rpartition(".")[2] in ("R", "G", "B")]
-        color = pixels[..., chosen].astype(np.float64)
-        if halves is None:
-            size = color.shape[:2]
-            halves = ReferenceHalves(np.zeros((size[0] * size[1], 3)))
-        halves.add(color.reshape(-1, 3), samples)
-    assert halves is not None, "there are at least two parts"
-    write_exr(path, halves.mean().astype(np.float32).reshape(*size, 3), ["R", "G", "B"])
+        images.append(pixels[..., [name.rpartition(".")[2] in ("R", "G", "B") for name in channels]])
+    halves = ReferenceHalves(np.zeros((images[0][..., 0].size, 3)))
+    for image in images:
+        halves.add(image.reshape(-1, 3).astype(np.float64), samples)
+    write_exr(path, halves.mean().astype(np.float32).reshape(images[0].shape), ["R", "G", "B"])
     return halves.noise() or 0.0
 
 
