@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -99,15 +99,11 @@ class _Entry:
         if self.failure:
             return OpCost(*about, failure=self.failure)
         a_mebibyte = 2**20 * 1e3 / bandwidth
-        cost = OpCost(*about, Spread.of(self.times), self.error, self.mebibytes, self.mebibytes * a_mebibyte)
+        alone = Spread.of(self.times), self.error, self.mebibytes, self.mebibytes * a_mebibyte
         if not self.times_with_derivatives:
-            return cost
-        return replace(
-            cost,
-            with_derivatives=Spread.of(self.times_with_derivatives),
-            mebibytes_with_derivatives=self.mebibytes_with_derivatives,
-            copy_with_derivatives=self.mebibytes_with_derivatives * a_mebibyte,
-        )
+            return OpCost(*about, *alone)
+        moved = self.mebibytes_with_derivatives
+        return OpCost(*about, *alone, Spread.of(self.times_with_derivatives), moved, moved * a_mebibyte)
 
 
 def benchmark_ops(
