@@ -324,21 +324,16 @@ def _board(out: Path, first: int, writes: bool) -> Iterator[Any]:
         return
     from torch.utils.tensorboard import SummaryWriter  # imported here because it takes a second
 
-    with _quiet_threads(), SummaryWriter(str(out), purge_step=first) as board:
-        yield board
-
-
-@contextmanager
-def _quiet_threads() -> Iterator[None]:
-    """Suppress printed errors of TensorBoard's thread; the next write raises them."""
     before = threading.excepthook
 
     def hook(failed: threading.ExceptHookArgs) -> None:
+        # The next write raises the errors of TensorBoard's thread.
         if not issubclass(failed.exc_type, OSError):
             before(failed)
 
     threading.excepthook = hook
     try:
-        yield
+        with SummaryWriter(str(out), purge_step=first) as board:
+            yield board
     finally:
         threading.excepthook = before
