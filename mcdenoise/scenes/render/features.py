@@ -101,7 +101,5 @@ class SequenceTracer(Tracer):
         """Position, and where the point was in the previous frame if anything moves."""
         mi, dr = self._mi, self._dr
         far = ray.o + (self.reach if self._scalar else dr.opaque(mi.Float, self.reach)) * ray.d
-        if self._scalar and not valid:
-            return [*far, *(far if self._stage.moves else [])]
         positions = [hit.p, self._earlier(hit, shot)] if self._stage.moves else [hit.p]
         return [channel for position in positions for channel in dr.select(valid, position, far)]

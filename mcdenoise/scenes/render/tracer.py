@@ -296,7 +296,8 @@ class Tracer:
     def _row(self, hit: Any) -> list[Any]:
         mi, dr = self._mi, self._dr
         if self._scalar:
-            row: Any = self._index.get((hit.instance or hit.shape).id(), 0)
+            shape = hit.instance or hit.shape
+            row: Any = self._index.get(shape.id(), 0) if shape else 0
         else:
             whole = dr.reinterpret_array(mi.UInt32, hit.instance)
             row = dr.select(whole > 0, whole, dr.reinterpret_array(mi.UInt32, hit.shape))

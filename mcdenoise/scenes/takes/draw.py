@@ -120,7 +120,7 @@ def draw_take(
         speed = float(move_rng.choice([-1, 1]) * np.exp(move_rng.uniform(math.log(0.2), math.log(3))))
         moves["sky"] = np.stack([rotate("y", speed * frame) for frame in range(count)])
     kind = _draw(rng, _FILTERS)
-    focus = max(distance(builder, cameras[0]), 0.05)
+    focus = distance(builder, cameras[0])
     blur = math.exp(rng.uniform(*np.log(_BLUR)))
     pixel = 2 * focus * math.tan(math.radians(fov) / 2) / size[0]
     lens, splat = rng.random() < _LENS, rng.random() < _SPLAT

@@ -105,15 +105,12 @@ class TakeTracer(Tracer):
     def _rest(self, ray: Any, hit: Any, valid: Any, shot: Any) -> list[Any]:
         """Way to where the point was in the previous frame, in pixels, and roughness; the sky turns with the camera."""
         mi, dr = self._mi, self._dr
-        if self._scalar and not valid:
-            now = then = mi.Vector3f(ray.d)
-            roughness = 0.0
-        else:
-            now = dr.select(valid, hit.p - mi.Point3f(*shot.camera[9:12]), mi.Vector3f(ray.d))
-            then = dr.select(valid, self._earlier(hit, shot) - mi.Point3f(*shot.before[9:12]), mi.Vector3f(ray.d))
-            roughness = dr.select(valid, self._row(hit)[0], 0)
-        start, end = self._raster(now, shot.camera), self._raster(then, shot.before)
-        return [end[0] - start[0], end[1] - start[1], roughness]
+        points = (hit.p, shot.camera), (self._earlier(hit, shot), shot.before)
+        start, end = (
+            self._raster(dr.select(valid, point - mi.Point3f(*camera[9:12]), mi.Vector3f(ray.d)), camera)
+            for point, camera in points
+        )
+        return [end[0] - start[0], end[1] - start[1], dr.select(valid, self._row(hit)[0], 0)]
 
     def _raster(self, way: Any, camera: Sequence[Any]) -> tuple[Any, Any]:
         dr, (width, height) = self._dr, self.take.size
