@@ -137,7 +137,7 @@ def _measure(
         made.denoisers,
         list(settings.sizes),
         rounds=settings.rounds,
-        threads=settings.threads,
+        peaks=made.peaks,
         device=settings.device,
         on_step=step,
     )

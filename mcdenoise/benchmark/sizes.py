@@ -81,29 +81,22 @@ def measure_sizes(
     sizes: list[Size],
     *,
     rounds: int,
-    threads: int,
+    peaks: Peaks,
     device: str,
-    on_step: Callable[[], None] = lambda: None,
+    on_step: Callable[[], None],
 ) -> tuple[list[Cost], list[Fit]]:
     """Time every method on synthetic frames of every size, taking turns: A B C, A B C.
 
     The first two frames, of which the second has a history, warm up and are not timed. A method is skipped at a size
     where it would need more than half of the free memory: four times what it needs at half of the width and height.
 
-    Args:
-        methods: methods to time.
-        made: the denoisers of the methods that could be constructed, by name.
-        sizes: widths and heights, ascending.
-        rounds: number of timed frames per method and size.
-        threads: number of threads, for measuring memory.
-        device: ``"cpu"`` or ``"cuda"``.
-        on_step: called ``rounds + 2`` times for each size.
+    ``made`` are the denoisers of the methods that could be constructed, by name; ``sizes`` are widths and heights,
+    ascending, at each of which there are ``rounds`` timed frames; ``on_step`` is called ``rounds + 2`` times for each.
 
     Returns:
         Milliseconds without reading and writing files, by size and method; and a fitted line for each method that was
         timed at two sizes or more.
     """
-    peaks = Peaks(threads, device)
     methods = [method for method in methods if method.name in made]
     costs: list[Cost] = []
     for width, height in sizes:
