@@ -118,7 +118,9 @@ def split(model: Model) -> tuple[Front, Model]:
     found, rest = 0, model
     # Exact types only, because derived classes may do anything.
     while isinstance(model, Wrapper) and type(model) in (Filtered, Demodulated, Accumulated, WithOidn):
-        wrappers.append((type(model), _settings(model)))
+        # A wrapper stores the arguments of its constructor under the same names.
+        _, *names = inspect.signature(type(model)).parameters
+        wrappers.append((type(model), {name: getattr(model, name) for name in names}))
         model = model.inner
         if wrappers[-1][0] is not Demodulated:
             found, rest = len(wrappers), model
@@ -126,9 +128,3 @@ def split(model: Model) -> tuple[Front, Model]:
     while type(rest) is Skipping:
         rest = rest.inner
     return front, Remodulated(rest) if front.demodulates else rest
-
-
-def _settings(wrapper: Wrapper) -> dict[str, Any]:
-    """The constructor arguments of a wrapper but the model inside, which it stores under the same names."""
-    _, *names = inspect.signature(type(wrapper)).parameters
-    return {name: getattr(wrapper, name) for name in names}
