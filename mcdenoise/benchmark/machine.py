@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from mcdenoise.errors import InputError
 from mcdenoise.results import Machine
 
 _PACKAGES = ("torch", "kornia", "numpy", "openimageio", "pyoidn", "flip-evaluator")
-_CGROUP = Path("/sys/fs/cgroup")
 
 
 def check_device(device: str) -> None:
@@ -39,8 +39,9 @@ def fix_threads(threads: int) -> None:
 
 def describe_machine(device: str) -> Machine:
     """Describe this machine, with torch's current number of threads."""
+    names = re.findall(r"(?m)^model name\s*: *(.+)", _text("/proc/cpuinfo"))
     return Machine(
-        processor=_processor(),
+        processor=names[0] if names else platform.processor() or platform.machine(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         memory=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
         device=torch.cuda.get_device_name() if device == "cuda" else "cpu",
@@ -54,34 +55,19 @@ def available_memory(device: str) -> int | None:
     """Bytes that can be allocated on the device now; ``None`` if the system does not report it."""
     if device == "cuda":
         return torch.cuda.mem_get_info()[0]
-    sizes = [size for size in (_free_memory(), _free_in_container()) if size is not None]
+    sizes = [int(size) * 1024 for size in re.findall(r"(?m)^MemAvailable: +(\d+)", _text("/proc/meminfo"))]
+    # A container without a limit says "max".
+    if (limit := _text("/sys/fs/cgroup/memory.max").strip()).isdecimal():
+        sizes.append(int(limit) - int(_text("/sys/fs/cgroup/memory.current")))
     return min(sizes, default=None)
 
 
-def _free_memory() -> int | None:
+def _text(path: str) -> str:
+    """What a file of the system says; nothing where there is none."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
+        return Path(path).read_text()
     except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
-
-
-def _free_in_container() -> int | None:
-    """Bytes up to the memory limit of the container; ``None`` without a limit."""
-    try:
-        limit, used = ((_CGROUP / name).read_text().strip() for name in ("memory.max", "memory.current"))
-    except OSError:
-        return None
-    return None if limit == "max" else int(limit) - int(used)
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor() or platform.machine())
+        return ""
 
 
 def _versions() -> dict[str, str]:
