@@ -112,7 +112,7 @@ def error_over_time(view: View, metric: str, colors: dict[str, str]) -> Figure:
     idle = [row for row in view.rows if row.milliseconds and row.milliseconds.value == 0 and metric in row.errors]
     axes.set_xlabel("milliseconds a frame, without reading and writing files")
     if not shown:
-        return _empty(axes)
+        return _empty(figure)
     best = [row.number for row in front(view, metric)]
     for row, x, y in shown:
         about: Any = {"color": colors[row.method.model], "linewidth": 1.1, "alpha": 0.65, "zorder": 3}
@@ -135,13 +135,13 @@ def error_over_time(view: View, metric: str, colors: dict[str, str]) -> Figure:
 def stage_bars(view: View) -> Figure:
     """How the median time of each method divides into stages, files included."""
     rows = [row for row in view.rows if row.stages]
-    axes = _axes(0.75 + 0.44 * max(len(rows), 1), left=6)
+    figure, axes = _axes(0.75 + 0.44 * max(len(rows), 1), left=6)
     axes.grid(axis="x")
     axes.spines["left"].set_visible(False)
     axes.yaxis.set_major_locator(NullLocator())
     axes.set_xlabel("milliseconds a frame, medians of the stages")
     if not rows:
-        return _empty(axes)
+        return _empty(figure)
     for place, row in enumerate(rows):
         left = 0.0
         for stage, time in row.stages.items():
@@ -152,7 +152,7 @@ def stage_bars(view: View) -> Figure:
         axes.annotate(f"{left:.0f}" if left >= 100 else f"{left:.3g}", (left, -place), (4, 0), **about)
     axes.set_ylim(-len(rows) + 0.6, 0.85)
     axes.set_xlim(0, 1.12 * max(sum(time.value for time in row.stages.values()) for row in rows))
-    return _figure_of(axes)
+    return figure
 
 
 def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
@@ -161,7 +161,7 @@ def cost_over_pixels(results: Results, colors: dict[str, str]) -> Figure:
     axes.set_xlabel("megapixels a frame")
     measured = [(cost, cost.milliseconds) for cost in results.costs if cost.milliseconds is not None]
     if not measured:
-        return _empty(axes)
+        return _empty(figure)
     fits = {fit.method: fit for fit in results.fits}
     for number, method in enumerate(results.methods, start=1):
         own = [(cost.width * cost.height / 1e6, spread) for cost, spread in measured if cost.method == method.name]
@@ -195,7 +195,7 @@ def error_over_samples(curves: dict[str, list[tuple[int, float]]], title: str) -
     figure, axes = _figure(title)
     axes.set_xlabel("samples a pixel")
     if not any(curves.values()):
-        return _empty(axes)
+        return _empty(figure)
     colors = iter(_COLORS * (1 + len(curves) // len(_COLORS)))
     for name, own in curves.items():
         color = _BASELINE if name == "input" else next(colors)
@@ -248,14 +248,14 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
 
 def _figure(title: str) -> tuple[Figure, Axes]:
-    axes = _axes(_HEIGHT, left=_TICK_ROOM)
+    figure, axes = _axes(_HEIGHT, left=_TICK_ROOM)
     axes.grid(True)
     axes.tick_params(length=3)
     axes.set_title(title, loc="left", fontsize=9.5, color=_INK)
-    return _figure_of(axes), axes
+    return figure, axes
 
 
-def _axes(height: float, *, left: float) -> Axes:
+def _axes(height: float, *, left: float) -> tuple[Figure, Axes]:
     """Axes in a new figure, inches; ``left`` is the room for the ticks' labels in points.
 
     Margins are fixed, because finding them takes longer than everything else, and there are many plots.
@@ -263,18 +263,13 @@ def _axes(height: float, *, left: float) -> Axes:
     figure = Figure(figsize=(_WIDTH, height))
     across, up = 1 / (72 * _WIDTH), 1 / (72 * height)
     figure.subplots_adjust(left=left * across, right=1 - 6 * across, bottom=36 * up, top=1 - 22 * up)
-    return figure.add_subplot()
+    return figure, figure.add_subplot()
 
 
-def _figure_of(axes: Axes) -> Figure:
-    figure = axes.get_figure()
-    assert isinstance(figure, Figure)
-    return figure
-
-
-def _empty(axes: Axes) -> Figure:
+def _empty(figure: Figure) -> Figure:
+    (axes,) = figure.axes
     axes.text(0.5, 0.5, "nothing to show", transform=axes.transAxes, ha="center", color=_MUTED)
-    return _figure_of(axes)
+    return figure
 
 
 def _log_axis(axis: Axis) -> None:
