@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Literal
+from typing import Any, Literal
 
 from mcdenoise.errors import InputError
 
@@ -107,20 +107,9 @@ def choose_rows(patterns: str | None = None) -> list[Row]:
 
 
 def _curve(name: str, renderer: Renderer, scene: str, pixel_filter: Filter, reference_samples: int) -> list[Shot]:
-    return [
-        Shot(
-            f"{name}-samples-{2**power}",
-            renderer,
-            scene,
-            2**power,
-            pixel_filter,
-            frames=1,
-            size=(240, 135),
-            reference_samples=reference_samples,
-            curve=True,
-        )
-        for power in range(11)
-    ]
+    still: dict[str, Any] = {"frames": 1, "size": (240, 135), "reference_samples": reference_samples, "curve": True}
+    samples = [2**power for power in range(11)]
+    return [Shot(f"{name}-samples-{spp}", renderer, scene, spp, pixel_filter, **still) for spp in samples]
 
 
 # Shots in the order of rendering, the most informative first. No training data have the assets of these takes.
