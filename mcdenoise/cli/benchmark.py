@@ -27,19 +27,10 @@ from mcdenoise.models import DEFAULT
 from mcdenoise.report import check_packages, write_report, write_sample_plots
 from mcdenoise.results import FILE
 from mcdenoise.shot import check_threads
-from mcdenoise.suite import (
-    SHOWN,
-    choose_rows,
-    error_against_time,
-    lines_of,
-    markdown,
-    open_row,
-    render_suite,
-    rows_there,
-    sample_curves,
-    with_peers,
-    write_close_ups,
-)
+from mcdenoise.suite.close_ups import write_close_ups
+from mcdenoise.suite.rendering import open_row, render_suite, rows_there
+from mcdenoise.suite.rows import choose_rows
+from mcdenoise.suite.tables import SHOWN, error_against_time, lines_of, markdown, sample_curves, with_peers
 
 
 def benchmark(

@@ -15,20 +15,11 @@ from refusals import refused
 from mcdenoise.data import read_exr, write_exr
 from mcdenoise.data.png import read_png
 from mcdenoise.results import Cell, Machine, Method, Results, Scene, Spread
-from mcdenoise.suite import (
-    Row,
-    Shot,
-    choose_rows,
-    error_against_time,
-    lines_of,
-    markdown,
-    open_row,
-    render_suite,
-    rendering,
-    rows_there,
-)
+from mcdenoise.suite import rendering
 from mcdenoise.suite.close_ups import PARTS, write_close_ups
-from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, verdict
+from mcdenoise.suite.rendering import open_row, render_suite, rows_there
+from mcdenoise.suite.rows import Row, Shot, choose_rows
+from mcdenoise.suite.tables import PSNR, SMAPE, TEMPORAL, error_against_time, lines_of, markdown, verdict
 
 BLENDER = os.environ.get("BLENDER_PYTHON")
 TINY: dict[str, Any] = {"frames": 2, "size": (16, 9), "reference_samples": 8}
