@@ -87,8 +87,8 @@ class ClipSampler:
     A clip of a shot of one frame has as many parts of it as it has frames: no network is trained on copies.
 
     Args:
-        shots: shots shorter than a clip are skipped, except for stills, which must have references on that frame and
-            shots on as many of their last ones.
+        shots: those shorter than a clip are skipped, except for stills, which must have a reference. Beside stills, the
+            others must have references on as many of their last frames as a clip has.
         config: says how long and wide a clip is, and how its light is changed: ``frames``, ``crop``, ``lamps``,
             ``key``, ``exposure`` and ``tint``. A lamp is up to 30 times as bright as the clip's mean.
 
