@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import warnings
 from collections.abc import Collection, Iterator, Mapping
@@ -22,6 +23,7 @@ from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import BUFFERS, Frame, Hints
 from mcdenoise.models import Model, State
 from mcdenoise.models._contract import check_needs
+from mcdenoise.models._wrapper import parts_of
 from mcdenoise.models.filtered import Filtered
 
 SUFFIXES = (".onnx", ".pt2")
@@ -50,8 +52,11 @@ class Step(nn.Module):
 
     def __init__(self, model: Model, buffers: Collection[str]) -> None:
         super().__init__()
-        # No graph can look for noise in features.
-        self.model = model.inner if isinstance(model, Filtered) and model.features == "auto" else model
+        self.model = copy.deepcopy(model)
+        for part in parts_of(self.model, Filtered):
+            # No graph can look for noise in features.
+            if part.features == "auto":
+                part.features, part.filters = "clean", nn.ModuleDict()
         self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
         self.given += tuple(sorted(set(buffers) - set(self.given)))
         check_needs(model.needs, self.given)

@@ -19,9 +19,10 @@ from torch import Tensor, nn
 
 from mcdenoise import Frame, create_model
 from mcdenoise.export import Exported, Step, default_buffers, export_model, traced
-from mcdenoise.models import Demodulated, Model, Needs, Output, State
+from mcdenoise.models import Demodulated, Model, Needs, Output, Restored, State
 from mcdenoise.models import Recurrent as Recurrence
 from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models.filtered import Filtered
 from mcdenoise.models.wild import WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 
@@ -232,6 +233,13 @@ def test_a_graph_counts_and_clamps_as_python_does(make: Callable[[], Model], tmp
     length = torch.full_like(buffers["color"][:, :1], 4.0)
     shot = [buffers | {"current": other["color"], "recent": other["color"], "length": length}]
     assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
+
+
+def test_a_graph_has_no_filters_of_features_that_are_looked_at_inside_a_wrapper() -> None:
+    model = Restored(Filtered(lambda color, albedo: color * albedo))  # type: ignore[arg-type]
+    step = Step(model, {"color", "albedo"})
+    assert not traced(step).state_dict
+    assert model.inner.features == "auto"  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow
