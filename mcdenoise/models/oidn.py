@@ -21,7 +21,9 @@ from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.noisy import Noisy, accumulated
+from mcdenoise.models.tiled import MIRRORED
 from mcdenoise.ops._numbers import unit_of
+from mcdenoise.ops._window import mirrored
 
 Quality = Literal["fast", "balanced", "high"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]
@@ -133,7 +135,8 @@ class Oidn(Filters):
     def filtered(self, images: dict[str, Tensor], quality: Quality, *, clean: bool) -> Tensor:
         """Run the library's filter, one image of the batch at a time, in float32; see :meth:`Filters.filtered`.
 
-        A dim color is divided by a power of two before it, and its result multiplied.
+        A dim color is divided by a power of two before it, and its result multiplied. A thin image, with a side below
+        16 pixels, gets its mirror image around it.
 
         Raises:
             InputError: a derivative in the color is requested; it would silently be zero.
@@ -148,7 +151,11 @@ class Oidn(Filters):
             if (mean < _DIM).any():
                 unit = torch.where(mean < _DIM, unit_of(mean), 1)
                 images = {**images, "color": images["color"] / unit}
-        batch, _, height, width = first.shape
+        # The library takes what is beyond an image for black: a single pixel would lose four fifths of its light.
+        margin = MIRRORED * (min(first.shape[-2:]) < MIRRORED)
+        images = {name: mirrored(image, (margin, margin), (margin, margin)) for name, image in images.items()}
+        batch, _, *size = first.shape
+        height, width = (side + 2 * margin for side in size)
         self._resize(height, width)
         denoiser = self._filter(tuple(images), quality, clean)
         results = []
@@ -158,7 +165,8 @@ class Oidn(Filters):
             denoiser.execute()
             self._check_device()
             results.append(self._images["output"].permute(2, 0, 1).to(first.device, copy=True).contiguous())
-        return torch.stack(results) if unit is None else torch.stack(results) * unit
+        result = torch.stack(results)[..., margin : height - margin, margin : width - margin]
+        return result if unit is None else result * unit
 
     def _resize(self, height: int, width: int) -> None:
         if self._images and self._images["output"].shape == (height, width, 3):
