@@ -77,7 +77,9 @@ class TrainingData:
         used = (needs.buffers | needs.uses) - front.parts.keys() - {"samples"}
         for source in sources:
             check_trainable(source, needs.buffers - front.parts.keys() | (used & set(FEATURES)))
-        for doubt in _doubts(sources, used, config.validation_frames * (not validation), accumulates=front.accumulates):
+        # Beside folders to validate on, the default is no wish.
+        wished = not validation or config.validation_frames != TrainConfig.validation_frames
+        for doubt in _doubts(sources, used, config.validation_frames * wished, accumulates=front.accumulates):
             warnings.warn(doubt, stacklevel=level_of_caller())
         # The last frames of a sequence are kept for validation, unless too few would remain.
         least, held = config.frames + config.validation_frames, [0] * len(takes)

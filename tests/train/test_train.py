@@ -187,11 +187,17 @@ def test_clips_of_unequally_many_references_leave_no_run(tmp_path: Path, other: 
 
 def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
     takes = [take(tmp_path / "0.take.npz", 3, 1)]
-    message = refused(lambda: train(TrainConfig(**SMALL), takes, tmp_path / "run", validation=takes))
+    config = TrainConfig(**{**SMALL, "validation_frames": 4})
+    message = refused(lambda: train(config, takes, tmp_path / "run", validation=takes))
     assert message.startswith("temporal_weight: ")
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_takes_that_keep_no_frames_for_validation_are_told(tmp_path: Path, beside: bool) -> None:
+    takes = [take(tmp_path / "0.take.npz", 3, 1)]
     config = TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0})
     with pytest.warns(UserWarning, match="validation_frames: expected 0 for takes, found 1; name other takes"):
-        train(config, takes, tmp_path / "run")
+        train(config, takes, tmp_path / "run", validation=takes if beside else None)
 
 
 @pytest.mark.parametrize(
