@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from mcdenoise.cli.train import options_of
 from mcdenoise.commit import source_commit
-from mcdenoise.data.files import atomic_path, write_text
+from mcdenoise.data.files import atomic_path
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.frame import Frame
 from mcdenoise.metrics import psnr_srgb, smape_linear
@@ -40,7 +40,7 @@ from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.train import TrainConfig
 from mcdenoise.train.front import split
-from mcdenoise.train.loop import begun
+from mcdenoise.train.loop import begun, check_finite
 from mcdenoise.train.losses import display_error
 from mcdenoise.train.recipe import Recipe
 from mcdenoise.train.run_folder import RunFolder, about_weights
@@ -51,6 +51,7 @@ RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
 YOUNG = 0.35  # probability that a frame has no history
 FASTER = 8.0  # factor of the learning rate of layers that begin with random weights
+KEPT = ("network", "average", "optimizer")
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
 
 
@@ -255,15 +256,9 @@ class Run:
         self.rest, self.averaged = split(self.network)[1], split(self.average)[1]
         self.rounded = fastest_precision(self.device).precision == "bfloat16"
         self.steps, self.passed, self.commits = 0, 0.0, list[dict[str, Any]]()
-        self.began()
-
-    def began(self) -> None:
-        """Note which source tree makes the steps from here on."""
-        if (commit := source_commit()) not in [each["commit"] for each in self.commits[-1:]]:
-            self.commits.append({"first_step": self.steps, "commit": commit})
 
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
-        """Make a step at a part of the time."""
+        """Make a step at a part of the time; return its loss and the norm of its gradient."""
         config = self.config
         rate = rate_of(self.steps, WARM_UP, part)
         for group in self.optimizer.param_groups:
@@ -275,32 +270,29 @@ class Run:
         loss = errors(image.float(), reference, config).mean()
         self.optimizer.zero_grad()
         loss.backward()
-        for weight in self.network.parameters():
-            # A clip that overflows must not end the run, and a test of it would wait for the device.
-            if weight.grad is not None:
-                weight.grad.nan_to_num_(0.0, 0.0, 0.0)
-        if config.gradient_norm:
-            nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm or math.inf)
         self.optimizer.step()
         self.steps += 1
         kept = min(config.ema, self.steps / (self.steps + 9))
         with torch.no_grad():
             torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), 1 - kept)
-        return loss.detach()
+        return torch.stack([loss.detach(), norm])
 
-    def keep(self, path: Path) -> None:
-        """Write a checkpoint."""
-        parts = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer")}
-        with atomic_path(path) as temporary:
-            torch.save({**parts, **{name: getattr(self, name) for name in ("steps", "passed", "commits")}}, temporary)
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint holds beside the number of steps and the commits."""
+        return {"passed": self.passed} | {name: getattr(self, name).state_dict() for name in KEPT}
 
-    def resume(self, path: Path) -> None:
-        """Go on from a checkpoint, with other draws."""
-        kept = torch.load(path, map_location=self.device, weights_only=True)
-        self.steps, self.passed, self.commits = kept["steps"], kept["passed"], kept.get("commits", [])
-        self.began()
-        for name in ("network", "average", "optimizer"):
-            getattr(self, name).load_state_dict(kept[name])
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from such a state."""
+        self.passed = state["passed"]
+        for name in KEPT:
+            getattr(self, name).load_state_dict(state[name])
+
+    def resume(self, folder: RunFolder) -> None:
+        """Go on from the checkpoint, with other draws, if there is one."""
+        self.steps, self.commits = folder.load(self)
+        folder.rewind(self.steps)
+        self.commits.append({"first_step": self.steps, "commit": source_commit()})
         torch.manual_seed(self.config.seed + self.steps)
         random.seed(self.config.seed + self.steps)
 
@@ -338,31 +330,30 @@ def main() -> None:
     watched = Tiles(options.validation, device) if options.validation else None
     # A resumed run would mix two runs, or mix its weights with other first ones.
     own = {"kept": options.kept, "initial_weights": run.start["sha256"]}
-    RunFolder(options.out).claim(config=asdict(config) | own)
-    names = (f"{config.model}.safetensors", "log.jsonl", "run.pt")
-    weights, record, checkpoint = (options.out / name for name in names)
-    log, losses, next_look = list[str](), list[Tensor](), 0.0
-    if checkpoint.exists():
-        run.resume(checkpoint)
-        log, start = record.read_text("utf-8").splitlines(), start - run.passed
+    folder, weights = RunFolder(options.out), options.out / f"{config.model}.safetensors"
+    folder.claim(config=asdict(config) | own)
+    run.resume(folder)
+    start, found, next_look = start - run.passed, list[Tensor](), 0.0
     while True:
         run.passed = time.monotonic() - start
         over = run.passed >= options.seconds and run.steps > 0
         if over or run.passed >= next_look:
             tiles.update()
-            row = {"step": run.steps, "seconds": round(run.passed, 1), "tiles": len(tiles.takes)}
-            row["loss"] = round(torch.stack(losses).mean().item(), 4) if losses else None
+            row = {"step": run.steps, "seconds": round(run.passed, 1), "tiles": len(tiles.takes), "loss": None}
+            if found:
+                means = dict(zip(("loss", "gradient"), torch.stack(found).mean(0).tolist(), strict=True))
+                check_finite(run.steps, means)
+                row["loss"] = round(means["loss"], 4)
             row |= validated(run.averaged, watched) if watched else {}
-            log.append(json.dumps(row))
-            write_text(record, "\n".join(log) + "\n")
+            folder.log(row)
             print({name: value for name, value in row.items() if name != "takes"}, flush=True)
             run.save(weights, {"sequences": tiles.about, "credits": recipe.credits, "recipe": chosen.sha256})
-            run.keep(checkpoint)
-            losses.clear()
+            folder.save(run.steps, run.commits, run)
+            found.clear()
             next_look = time.monotonic() - start + max(LOOK, options.seconds / LOOKS)
         if over:
             break
-        losses.append(run.step(tiles, options.clips, run.passed / options.seconds))
+        found.append(run.step(tiles, options.clips, run.passed / options.seconds))
     print(weights)
 
 

@@ -7,7 +7,7 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -245,12 +245,7 @@ class Trainer:
         )
         mean = torch.as_tensor(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))
         found = {"loss": mean.item(), "gradient": torch.as_tensor(norm).item()}
-        for name, value in found.items():
-            if not math.isfinite(value):
-                raise InputError(
-                    f"training, step {step}: expected a finite {name}, found {value}; the last checkpoint is kept: "
-                    "start a new run with a lower learning rate or a limit on the gradient's norm"
-                )
+        check_finite(step, found)
         self.stepper.step()
         self.scheduler.step()
         if self.average is not None:
@@ -265,6 +260,20 @@ class Trainer:
         scores = validate(split(result)[1], data.watched, self.fabric, board, step)
         result.train(training)
         return scores
+
+
+def check_finite(step: int, found: Mapping[str, float]) -> None:
+    """Check what a step found.
+
+    Raises:
+        InputError: a number is not finite; the message has its name.
+    """
+    for name, value in found.items():
+        if not math.isfinite(value):
+            raise InputError(
+                f"training, step {step}: expected a finite {name}, found {value}; the last checkpoint is kept: "
+                "start a new run with a lower learning rate or a limit on the gradient's norm"
+            )
 
 
 def _moving_average(network: nn.Module, decay: float) -> AveragedModel:

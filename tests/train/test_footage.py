@@ -318,6 +318,14 @@ def test_without_a_history_all_frames_are_handed(tmp_path: Path) -> None:
     assert "reference" not in shot.cut(slice(2, 4)).read()
 
 
+def test_a_reference_without_light_in_a_pixel_is_mended_as_a_color_is(tmp_path: Path) -> None:
+    arrays = take(tmp_path).read()
+    arrays["reference"][:, 1, 2, 3], arrays["color"][0, :, 4, 5] = np.nan, np.inf
+    write_shard(tmp_path / "0.take.npz", {}, arrays)
+    (shot,), _ = shots_of(open_shard(tmp_path / "0.take.npz"), Front(), frozenset(), 3, tmp_path)
+    assert all(image.isfinite().all() for image in shot.read().values())
+
+
 @pytest.mark.parametrize("front", [Front(), HISTORY], ids=["alone", "accumulated"])
 def test_a_clip_of_a_still_has_as_many_parts_of_it(front: Front, tmp_path: Path) -> None:
     sources = take(tmp_path, 1, 1), take(tmp_path, 8, 3)
