@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from commands import refuses, run, succeeds
 from numpy.typing import NDArray
+from pictures import as_channels, part_of
 
 from mcdenoise import denoise
 from mcdenoise.data import open_sequence, read_exr, write_exr
@@ -103,6 +105,15 @@ def test_what_cannot_be_one_file_is_refused(
     assert not any(Path(name).exists() for name in ("out.pfm", "out.JPG"))
     for name, buffer in (("x", "x"), ("y", "y"), ("shot_1", "x")):
         np.testing.assert_array_equal(read(Path(f"{name}.pfm")), buffers[buffer])
+
+
+def test_another_format_has_what_the_display_window_shows(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    channels = as_channels({"": buffers["x"]})
+    height, width = buffers["x"].shape[:2]
+    part = part_of(channels, place=(-3, -5), display=(height - 6, width - 9))
+    OpenEXR.File([part]).write(str(tmp_path / "wide.exr"))
+    succeeds("denoise", tmp_path / "wide.exr", "-o", tmp_path / "out.pfm", "--model", "noisy")
+    np.testing.assert_array_equal(read(tmp_path / "out.pfm"), buffers["x"][3:-3, 5:-4])
 
 
 @pytest.mark.parametrize(("layers", "out"), [("parts.exr", "out.exr"), ("parts.exr", "out.pfm"), ("shot.exr", "out")])

@@ -22,7 +22,7 @@ from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
 from mcdenoise.data.files import folder_beside, listed
-from mcdenoise.data.images import FORMATS, Metadata
+from mcdenoise.data.images import FORMATS, Metadata, read_image_header
 from mcdenoise.data.radiance import write_radiance
 from mcdenoise.data.readers.names import find_files
 from mcdenoise.errors import InputError
@@ -65,8 +65,9 @@ def denoise(
             be an EXR with layers, or one file per buffer; `mcdenoise inspect` shows which layer each buffer is read
             from.
         out: for one frame, a file such as clean.exr, .pfm, .hdr, .tif or .png: a copy of the input with denoised
-            radiance, or the radiance alone in another format. Or a folder to write to: files of the same names, with
-            denoised radiance and all other layers unchanged (for the BMFR layout: denoisedN.exr), and denoise.json.
+            radiance, or the radiance alone in another format, without overscan. Or a folder to write to: files of the
+            same names, with denoised radiance and all other layers unchanged (for the BMFR layout: denoisedN.exr), and
+            denoise.json.
         shot: options for reading, denoising and writing the shot.
         albedo: file of the albedo of a single frame, if it is not a layer of the input.
         normal: likewise, of the normals.
@@ -104,8 +105,13 @@ def denoise(
         else:
             # Not what the copy of the input holds, which may have been rounded to its type. No primaries are stated.
             ((image, metadata),) = images
-            radiance = to_rec709(image[0].float(), metadata)
-            clamped = write_radiance(out, radiance.permute(1, 2, 0).cpu().numpy())
+            pixels = to_rec709(image[0].float(), metadata).permute(1, 2, 0).cpu().numpy()
+            for part in read_image_header(written).parts:
+                # Overscan is there for filters, and not shown; other formats have no windows.
+                if part.window.size == pixels.shape[:2] and part.window.holds(part.display):
+                    pixels = part.display.of(pixels, part.window)
+                    break
+            clamped = write_radiance(out, pixels)
             if clamped:
                 warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
             if shot.alpha:

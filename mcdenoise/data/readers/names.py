@@ -44,8 +44,8 @@ def find_files(inputs: Sequence[Path]) -> list[Path]:
     """Find the image files for given folders, files and patterns, sorted.
 
     Args:
-        inputs: folders, for all images in them that are not hidden; files; and patterns, whose last part may contain
-            ``####``, ``%04d``, ``*``, ``?`` and ``[...]``.
+        inputs: folders, for all images in them, or if there are none in their folders, that are not hidden; files; and
+            patterns, whose last part may contain ``####``, ``%04d``, ``*``, ``?`` and ``[...]``.
 
     Raises:
         InputError: a path or pattern matches nothing.
@@ -53,7 +53,9 @@ def find_files(inputs: Sequence[Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for given in inputs:
         if os.path.isdir(given):
-            new = _images_in(given)
+            # A folder of folders has one for each buffer.
+            inside = [each for each in listed(given) if os.path.isdir(each) and not each.name.startswith(".")]
+            new = _images_in(given) or [image for each in inside for image in _images_in(each)]
         elif os.path.lexists(given):
             # It may be anything; opening it reports the error.
             new = [given]

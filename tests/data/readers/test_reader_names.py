@@ -184,6 +184,7 @@ def test_buffers_of_a_still(names: list[str], image: Callable[..., list[Path]], 
 def test_a_folder_for_each_buffer(image: Callable[..., list[Path]], tmp_path: Path) -> None:
     image(*[f"{folder}/{number:04d}.exr" for folder in ("color", "albedo", "normal") for number in (1, 2)])
     sequence = open_sequence([tmp_path / folder for folder in ("albedo", "color", "normal")])
+    assert open_sequence(tmp_path).table == sequence.table
     taken = {row.buffer: row.source for row in sequence.table}
     assert taken == {name: f"{name}/####.exr" for name in ("color", "albedo", "normal")}
     assert float(sequence.frame(2).color[0, 0, 0, 0]) == 2
