@@ -55,6 +55,16 @@ def test_a_file_is_denoised_to_a_file_of_any_format(
     np.testing.assert_allclose(read(out), expected, rtol=relative, atol=absolute)
 
 
+def test_an_albedo_may_be_grey_and_a_normal_not(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
+    grey, out = tmp_path / "grey.pfm", tmp_path / "out.pfm"
+    write_radiance(grey, buffers["y"][..., :1])
+    noisy = ("denoise", tmp_path / "x.pfm", "-o", out, "--model", "joint_bilateral")
+    succeeds(*noisy, "--albedo", grey)
+    expected = denoise(buffers["x"], albedo=buffers["y"], model="joint_bilateral")
+    np.testing.assert_allclose(read(out), expected, rtol=1e-6)
+    assert "grey.pfm: expected channels of the buffer 'normal'" in refuses(*noisy, "--normal", grey)
+
+
 def test_the_result_is_not_rounded_as_its_input_was(buffers: dict[str, NDArray[Any]], tmp_path: Path) -> None:
     """Nor are files taken for frames of one shot whose names differ in zeros only."""
     noisy, albedo, out = tmp_path / "x_01.png", tmp_path / "x_1.png", tmp_path / "out.pfm"

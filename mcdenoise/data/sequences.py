@@ -34,9 +34,9 @@ def open_sequence(
     """Open the frames of a shot: the headers of all selected files are checked, and the pixels of the first frame.
 
     Args:
-        path: a folder, or a folder that contains it as ``inputs``; a file; a pattern such as ``shot_####.exr``; or
-            several of these; or one for each buffer, by buffer. For Noisebase: the zip of a sequence, the zips of its
-            frames, or a folder of zips.
+        path: a folder, or a folder that contains it as ``inputs``, or one for each buffer; a file; a pattern such as
+            ``shot_####.exr``; or several of these; or one for each buffer, by buffer. For Noisebase: the zip of a
+            sequence, the zips of its frames, or a folder of zips.
         frames: frames to use, such as ``"0-59,70"``; all by default.
         mapping: layers by buffer if names do not tell, such as ``"albedo=RGBA.diff"``; ``"motion="`` for none.
         color_has_albedo: whether the radiance includes the albedo; by default determined from the values.
@@ -46,7 +46,7 @@ def open_sequence(
 
     Raises:
         InputError: nothing was found, the files cannot be recognised, a frame or buffer is missing, or files do not
-            match one another.
+            match one another or the buffer that they are given as.
     """
     by_buffer = path if isinstance(path, Mapping) else {}
     given = _given(path.values() if isinstance(path, Mapping) else path)
@@ -82,6 +82,8 @@ def open_sequence(
             groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
         named = parse_mapping(mapping)
         sequence = open_files(groups, chosen, where, named, color_has_albedo, lights, color_space)
+        for name in (each for each in by_buffer if each not in sequence.buffers):
+            raise InputError(f"{by_buffer[name]}: expected channels of the buffer '{name}', found others; leave it out")
     place = given[0].resolve()
     name = place.parent.name if place.name == "inputs" else place.name
     return replace(sequence, root=given[0], name=name, layout=layout, warnings=[*gaps, *sequence.warnings])

@@ -54,7 +54,7 @@ _ORDER = {
     for spelling in row.split()
 }
 # Buffers of three channels that may have one, and names of it.
-GREY = frozenset({"color", "reference"})
+GREY = frozenset({"color", "reference", "albedo"})
 _LUMINANCE = {"y", "l", "luminance", "grey", "gray"}
 _EYES = {"left", "right"}
 _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})

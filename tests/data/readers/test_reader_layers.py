@@ -131,7 +131,7 @@ def test_a_layer_is_asked_for_in_any_of_its_forms(text: str, layered: Path) -> N
     ("texts", "expected"),
     [
         (["albedo=DiffCol"], "expected one layer for --map albedo=DiffCol, found none; there are View.Combined.RGBA"),
-        (["albedo=Depth"], "expected 3 channels for --map albedo=Depth, found 1"),
+        (["normal=Depth"], "expected 3 channels for --map normal=Depth, found 1"),
         (["motion=View.Depth.Z"], "expected 2 channels for --map motion=View.Depth.Z, found 1"),
         (["albedo=a.R,nothing.R,b.R"], "expected one layer for --map albedo=a.R,nothing.R,b.R, found none"),
         (["albdeo=N1"], "expected BUFFER=LAYER with a buffer of albedo, alpha"),
