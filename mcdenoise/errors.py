@@ -116,7 +116,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 def level_of_caller() -> int:
     """The ``stacklevel`` with which a warning shows the line that called this package, instead of a line in it."""
     level, frame = 1, sys._getframe(1)
-    while frame.f_globals.get("__name__", "").partition(".")[0] == __package__ and frame.f_back is not None:
+    # Some functions of this package are decorated by a context.
+    own = (__package__, "contextlib")
+    while frame.f_globals.get("__name__", "").partition(".")[0] in own and frame.f_back is not None:
         level, frame = level + 1, frame.f_back
     return level
 

@@ -196,8 +196,9 @@ def test_changes_of_a_single_reference_are_not_compared(tmp_path: Path) -> None:
 def test_takes_that_keep_no_frames_for_validation_are_told(tmp_path: Path, beside: bool) -> None:
     takes = [take(tmp_path / "0.take.npz", 3, 1)]
     config = TrainConfig(**{**SMALL, "steps": 1, "temporal_weight": 0.0})
-    with pytest.warns(UserWarning, match="validation_frames: expected 0 for takes, found 1; name other takes"):
+    with pytest.warns(UserWarning, match="validation_frames: expected 0 for takes, found 1; name other takes") as told:
         train(config, takes, tmp_path / "run", validation=takes if beside else None)
+    assert told[0].filename == __file__
 
 
 @pytest.mark.parametrize(
