@@ -15,8 +15,9 @@ from mcdenoise.ops.moments import luminance
 SIGMA_L = 4.0
 # h of Eq. 1, along one axis.
 _KERNEL = (1 / 16, 1 / 4, 3 / 8, 1 / 4, 1 / 16)
-# The smallest deviation: the epsilon of Eq. 5, which the paper leaves open.
-_LEAST_DEVIATION = 1e-18
+# The smallest deviation, the epsilon of Eq. 5, which the paper leaves open, and the scale in which it has a square in
+# float32, as has the largest deviation: dim light is filtered as bright light is.
+_LEAST_DEVIATION, _SCALE = 2.0**-69, 64
 
 
 @made_of(edge_average)
@@ -41,7 +42,7 @@ def atrous(
     - ``w_n = max(0, n[p] . n[q])^sigma_n`` (Eq. 4), as ``max(0, 1 - |n[p] - n[q]|^2 / 2)^sigma_n``, which is the same
       for unit normals, and 1 for two pixels without one,
     - ``w_l = exp(-|l[p] - l[q]| / (sigma_l sqrt(g(variance)[p])))`` (Eq. 5), with the luminance ``l`` of
-      :func:`mcdenoise.ops.luminance_moments` and the 3x3 Gaussian ``g``; a deviation is at least 1e-18.
+      :func:`mcdenoise.ops.luminance_moments` and the 3x3 Gaussian ``g``; a deviation is at least 2^-69.
 
     ``slope`` is the difference of the depths of two neighbouring pixels, on that side on which it is smaller: the other
     may lie beyond an edge. Pixels that hit nothing are alike in depth, and unlike all others.
@@ -84,7 +85,7 @@ def atrous(
     _check_settings(step, sigma_z, sigma_n, sigma_l)
     dtype = accumulator_dtype(light.dtype)
     image, noise = light.to(dtype), variance.to(dtype)
-    deviation = sigma_l * torch.sqrt(blurred(noise) + _LEAST_DEVIATION**2)
+    deviation = sigma_l / _SCALE * torch.sqrt(blurred(noise) * _SCALE**2 + (_LEAST_DEVIATION * _SCALE) ** 2)
     filtered, remaining = edge_average(
         *(image, noise, normal, depth, luminance(image[:, :3]), deviation),
         kernel=_KERNEL,
