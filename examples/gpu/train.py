@@ -258,7 +258,10 @@ class Run:
         self.steps, self.passed, self.commits = 0, 0.0, list[dict[str, Any]]()
 
     def step(self, tiles: Tiles, clips: int, part: float) -> Tensor:
-        """Make a step at a part of the time; return its loss and the norm of its gradient."""
+        """Make a step at a part of the time; return its loss and the norm of its gradient.
+
+        Parts of the gradient that are not finite count as 0: a clip that overflows must not end the run.
+        """
         config = self.config
         rate = rate_of(self.steps, WARM_UP, part)
         for group in self.optimizer.param_groups:
@@ -270,7 +273,12 @@ class Run:
         loss = errors(image.float(), reference, config).mean()
         self.optimizer.zero_grad()
         loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm or math.inf)
+        slopes = [weight.grad for weight in self.network.parameters() if weight.grad is not None]
+        norm = nn.utils.get_total_norm(slopes)
+        for slope in slopes:
+            slope.nan_to_num_(0.0, 0.0, 0.0)
+        if config.gradient_norm:
+            nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
         self.optimizer.step()
         self.steps += 1
         kept = min(config.ema, self.steps / (self.steps + 9))
@@ -341,9 +349,11 @@ def main() -> None:
             tiles.update()
             row = {"step": run.steps, "seconds": round(run.passed, 1), "tiles": len(tiles.takes), "loss": None}
             if found:
-                means = dict(zip(("loss", "gradient"), torch.stack(found).mean(0).tolist(), strict=True))
-                check_finite(run.steps, means)
-                row["loss"] = round(means["loss"], 4)
+                steps = torch.stack(found).cpu()
+                whole = steps[steps.isfinite().all(1)]
+                # No number, and an error, if not one step was finite.
+                check_finite(run.steps, {"loss": float(whole[:, 0].mean())})
+                row |= {"loss": round(float(whole[:, 0].mean()), 4), "not_finite": len(steps) - len(whole)}
             row |= validated(run.averaged, watched) if watched else {}
             folder.log(row)
             print({name: value for name, value in row.items() if name != "takes"}, flush=True)
