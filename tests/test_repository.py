@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -48,6 +49,11 @@ def files() -> list[Path]:
 def test_files_are_small(files: list[Path]) -> None:
     assert [path.name for path in files if path.suffix != ".safetensors" and path.stat().st_size > FILE_LIMIT] == []
     assert [path.name for path in files if path.suffix == ".whl"] == []
+
+
+def test_no_mutant_is_stale() -> None:
+    mutants = runpy.run_path(str(ROOT / "tests" / "mutants" / "mutants.py"))["MUTANTS"]
+    assert [each.name for each in mutants if (ROOT / "mcdenoise" / each.file).read_text().count(each.right) != 1] == []
 
 
 def text_of(path: Path) -> str:

@@ -93,8 +93,8 @@ MUTANTS = tuple(
         ("accumulate", "ops/temporal.py", "base.long(), q - base", "base.long(), (q - base).detach()"),
         ("atrous", "ops/atrous.py", "torch.sqrt(blurred(noise)", "torch.sqrt(blurred(noise.detach())"),
         # Range and precision.
-        (_LAG, "ops/lag.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
-        ("temporal_gradient", "ops/gradients.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
+        (_LAG, "ops/_numbers.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
+        ("temporal_gradient", "ops/_numbers.py", "torch.where(largest > 0, power, 1)", "torch.ones_like(largest)"),
         ("softmax_splat", "ops/softmax_splat.py", "exponents - arriving.reshape(exponents.shape)", "exponents"),
         ("importance_filter", "ops/importance.py", "torch.exp(self.maximum - maximum)", "torch.exp(self.maximum)"),
         ("block_regression", "ops/regression.py", "x - x[:, :1].detach()", "x"),
@@ -105,7 +105,7 @@ MUTANTS = tuple(
             "first, second = mean.to(moments.dtype).to(mean.dtype).split(1, 1)",
         ),
         # Models.
-        (_MODEL, "nn/oidn.py", "_KEY / torch.exp2(mean)", "_KEY"),
+        (_MODEL, "nn/oidn.py", "torch.where(count > 0, torch.exp2(mean), _LEAST)", "(1 + 0 * mean)"),
         (_MODEL, "ops/_steps/wild.py", "expand(mixed) / exposure", "expand(mixed)"),
         ("model:cascaded", "nn/inputs.py", "torch.where(lit, key / typical, 1)", "torch.where(lit, key, 1)"),
     )
