@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -88,10 +89,13 @@ def test_a_frame_that_changes_while_the_film_runs_is_made_again_by_the_next_run(
 
     def change() -> None:
         while left:
-            edit(left.pop())
+            new = Path(shutil.copy(left.pop(), tmp_path / "new.exr"))
+            edit(new)
             # Of the same size; and a copy may keep the time of its source.
-            path.write_bytes(path.read_bytes().ljust(20_000))
-            os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+            new.write_bytes(new.read_bytes().ljust(20_000))
+            os.utime(new, ns=(status.st_atime_ns, status.st_mtime_ns))
+            # At once: another thread may be reading the file for the frame that it writes.
+            new.replace(path)
 
     monkeypatch.setattr(Sequence, "frame", frame)
     result = run(shot, tmp_path / "out")
