@@ -352,8 +352,9 @@ def main() -> None:
                 steps = torch.stack(found).cpu()
                 whole = steps[steps.isfinite().all(1)]
                 # No number, and an error, if not one step was finite.
-                check_finite(run.steps, {"loss": float(whole[:, 0].mean())})
-                row |= {"loss": round(float(whole[:, 0].mean()), 4), "not_finite": len(steps) - len(whole)}
+                loss = float(whole[:, 0].mean())
+                check_finite(run.steps, {"loss": loss})
+                row |= {"loss": round(loss, 4), "not_finite": len(steps) - len(whole)}
             row |= validated(run.averaged, watched) if watched else {}
             folder.log(row)
             print({name: value for name, value in row.items() if name != "takes"}, flush=True)

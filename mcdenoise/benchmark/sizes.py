@@ -90,8 +90,14 @@ def measure_sizes(
     The first two frames, of which the second has a history, warm up and are not timed. A method is skipped at a size
     where it would need more than half of the free memory: four times what it needs at half of the width and height.
 
-    ``made`` are the denoisers of the methods that could be constructed, by name; ``sizes`` are widths and heights,
-    ascending, at each of which there are ``rounds`` timed frames; ``on_step`` is called ``rounds + 2`` times for each.
+    Args:
+        methods: methods to time.
+        made: the denoisers of the methods that could be constructed, by name.
+        sizes: widths and heights, ascending.
+        rounds: number of timed frames per method and size.
+        peaks: measures memory.
+        device: ``"cpu"`` or ``"cuda"``.
+        on_step: called ``rounds + 2`` times for each size.
 
     Returns:
         Milliseconds without reading and writing files, by size and method; and a fitted line for each method that was

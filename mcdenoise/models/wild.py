@@ -32,7 +32,7 @@ from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._constants import RECENT_ALPHA
 from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress
 from mcdenoise.ops._steps.wild import wild_choice, wild_input
-from mcdenoise.ops._window import corner, up_to_multiple
+from mcdenoise.ops._window import block_means, corner, up_to_multiple
 from mcdenoise.ops.lag import THRESHOLD
 
 # The mean of frame and history, albedo, normal as the library sees them; the frame, the accumulated radiance; the part
@@ -109,7 +109,7 @@ class Trust(nn.Module):
         of_normal = of_normal.sum(1, keepdim=True)
         lengths = of_normal + normal.square().sum(1, keepdim=True)
         # Means of radiance, which noise does not change.
-        far = _apart(compress(F.avg_pool2d(light, 4, ceil_mode=True, count_include_pad=False)))
+        far = _apart(compress(block_means(light, 4)))
         far = corner(F.interpolate(far, scale_factor=4, mode="bilinear", align_corners=False), *part.shape[-2:])
         variances = torch.cat([variances, of_normal], 1)
         differences = torch.cat([apart, _apart(means), far, variances.clamp_min(_LEAST**2).sqrt()], 1)

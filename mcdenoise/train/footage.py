@@ -192,10 +192,8 @@ def _repeated(color: Array) -> int:
 def _packed(shard: Shard, noise_seed: int) -> dict[str, Array]:
     arrays = shard.read()
     # A reference comes from the same renderer as the color.
-    try:
+    with naming(str(shard.path)):
         mended = {name: replace_invalid(torch.from_numpy(arrays[name]))[0].numpy() for name in ("color", "reference")}
-    except InputError as error:
-        raise InputError(f"{shard.path}: {error}") from error
     return arrays | mended
 
 
