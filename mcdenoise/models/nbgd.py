@@ -94,6 +94,8 @@ class NeuralBilateralGrid(Network):
         smooth = [_smoothed(light, *each) for each in zip(guides, GRIDS, strict=True)]
         weights = [first, second, 1 - first - second]
         image = _sum(weights, [each[:, :3] for each in smooth]).clamp_min(0)
+        if light.shape[1] == 3:
+            return Output(image), None
         # Layers and alpha require a mean with non-negative weights.
         weights = [weight.clamp_min(0) for weight in weights]
         total = _sum(weights, [each[:, 3:] for each in smooth]) / (weights[0] + weights[1] + weights[2])

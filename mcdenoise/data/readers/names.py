@@ -53,9 +53,11 @@ def find_files(inputs: Sequence[Path]) -> list[Path]:
     found: dict[Path, None] = {}
     for given in inputs:
         if os.path.isdir(given):
-            # A folder of folders has one for each buffer.
-            inside = [each for each in listed(given) if os.path.isdir(each) and not each.name.startswith(".")]
-            new = _images_in(given) or [image for each in inside for image in _images_in(each)]
+            new = _images_in(given)
+            if not new:
+                # A folder of folders has one for each buffer.
+                inside = [each for each in listed(given) if os.path.isdir(each) and not each.name.startswith(".")]
+                new = [image for each in inside for image in _images_in(each)]
         elif os.path.lexists(given):
             # It may be anything; opening it reports the error.
             new = [given]
