@@ -15,9 +15,9 @@ import pytest
 import torch
 from commands import succeeds
 
-from mcdenoise import Frame
+from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
-from mcdenoise.models import _layers
+from mcdenoise.models import create_model
 
 ROOT = Path(__file__).resolve().parents[1]
 EXTENSION = ROOT / "extensions" / "blender"
@@ -39,9 +39,10 @@ def test_buffers_are_read_as_by_the_package(shot: str, frames: Any, tmp_path: Pa
     frame = sequence.frame(sequence.numbers[-1]).validate()[0]
     seen: dict[str, Any] = {}
 
-    def denoise(buffers: dict[str, Any]) -> Any:
+    def denoise(buffers: dict[str, Any], lights: dict[str, Any]) -> Any:
+        assert not lights
         seen.update(buffers)
-        return 2 * buffers["color"]
+        return 2 * buffers["color"], lights
 
     frames.denoise_frame(denoise, source, tmp_path / "out" / "new.exr", SHOTS[shot])
     for name, image in seen.items():
@@ -65,24 +66,53 @@ def parts(path: Path) -> dict[str, Any]:
     return found
 
 
-def test_layers_of_light_are_split_as_by_the_package(frames: Any) -> None:
-    lights = {name: torch.rand(1, 3, 6, 8) for name in ("a", "b")}
-    for light in lights.values():
-        light[..., :2] = 0
-    color, image = sum(lights.values()) * torch.linspace(0.995, 1.5, 8), torch.rand(1, 3, 6, 8)
+@pytest.mark.parametrize("shot", SHOTS)
+def test_lights_are_read_as_by_the_package_and_replaced(shot: str, frames: Any, tmp_path: Path) -> None:
+    source = sorted((RENDERED / shot).glob("*.exr"))[-1]
+    seen: dict[str, Any] = {}
 
-    def numpy(images: dict[str, torch.Tensor]) -> list[Any]:
-        return [each[0].permute(1, 2, 0).numpy() for each in images.values()]
+    def lights(path: Path, *mapping: str) -> dict[str, Any]:
+        sequence = open_sequence(path, mapping=mapping, lights=("all",))
+        layers = sequence.frame(sequence.numbers[0]).layers
+        return {name.rpartition(".")[2]: layer[0].permute(1, 2, 0).numpy() for name, layer in layers.items()}
 
-    given = dict(zip(lights, numpy(lights), strict=True))
-    noisy = _layers.closed(
-        Frame(color, layers=lights), lambda excess, handle: handle(excess.reshape(1).tolist())
-    ).layers
-    found = frames.closed(*numpy({"": color}), given)
-    np.testing.assert_allclose([*found.values()], numpy(dict(noisy)), rtol=1e-6)
-    found = frames.in_proportion(*numpy({"": image}), found)
-    np.testing.assert_allclose([*found.values()], numpy(_layers.split(image, noisy)), rtol=1e-6)
-    np.testing.assert_allclose(sum(found.values()), numpy({"": image})[0], rtol=1e-6)
+    def denoise(buffers: dict[str, Any], lights: dict[str, Any]) -> Any:
+        seen.update(lights)
+        return 2 * buffers["color"], {name: 2 * light for name, light in lights.items()}
+
+    before = lights(source)
+    frames.denoise_frame(denoise, source, tmp_path / source.name, SHOTS[shot], lights=True)
+    assert seen.keys() == before.keys()
+    assert len(before) > 4
+    for name, light in before.items():
+        np.testing.assert_allclose(seen[name], light, rtol=1e-6)
+    after = lights(tmp_path / source.name, "color=Combined")
+    assert after.keys() == before.keys()
+    # Where a pass has no color, the others have its light.
+    np.testing.assert_allclose(sum(after.values()), 2 * sum(before.values()), rtol=4e-3, atol=1e-4)
+
+
+@torch.no_grad()
+def test_a_light_is_split_as_by_the_denoiser() -> None:
+    model, size = create_model("wild_small"), (33, 47)
+    split, denoiser = runpy.run_path(str(EXTENSION / "build.py"))["Light"](model).eval(), Denoiser(model)
+    states: dict[str, Any] = {}
+    for _ in range(3):
+        # In places darker than the lights, in others with light of its own.
+        lights = {name: torch.rand(1, 3, *size) ** 4 for name in ("a", "b", "c")}
+        total = sum(lights.values(), torch.zeros(1, 3, *size))
+        frame = Frame(
+            total * torch.linspace(0.995, 1.5, size[1]),
+            albedo=torch.rand(1, 3, *size),
+            normal=torch.nn.functional.normalize(torch.randn(1, 3, *size), dim=1),
+            depth=1 + torch.rand(1, 1, size[0], 1).expand(1, 1, *size),
+            motion=torch.full((1, 2, *size), 0.3),
+        )
+        expected = denoiser.output(frame.replace(layers=lights))
+        for name, light in lights.items():
+            given = frame.replace(diffuse=expected.image, extra={"light": light, "total": total})
+            output, states[name] = split(given, states.get(name))
+            torch.testing.assert_close(output.image, expected.layers[name], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +124,8 @@ def test_what_cannot_be_denoised_is_said_in_one_line(
 ) -> None:
     with pytest.raises(frames.FrameError) as error:
         frames.denoise_frame(
-            lambda buffers: buffers["color"], RENDERED / "blender_filtered" / name, tmp_path / "x.exr", layer
+            lambda buffers, lights: (buffers["color"], lights),
+            *(RENDERED / "blender_filtered" / name, tmp_path / "x.exr", layer),
         )
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
@@ -139,9 +170,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_zip_denoises_in_blender_as_the_command_does(frames: Any, archive: Path, tmp_path: Path) -> None:
     assert archive.stat().st_size < 60e6
     with zipfile.ZipFile(archive) as file:
-        assert {"blender_manifest.toml", "__init__.py", "frames.py", "model.onnx", "smoother.onnx"} < set(
-            file.namelist()
-        )
+        graphs = {"features.onnx", "model.onnx", "light.onnx"}
+        assert {"blender_manifest.toml", "__init__.py", "frames.py", *graphs} < set(file.namelist())
     render = ROOT / "examples" / "blender" / "render.py"
     shot = tmp_path / "my shot"
     subprocess.run([PYTHON, render, "-o", shot, "--size", "96x64", "--frames", "4", "--samples", "2"], check=True)

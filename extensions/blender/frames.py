@@ -10,7 +10,6 @@ try:
 except ImportError:
     import OpenImageIO as oiio
 
-MODEL, SMOOTHER = (Path(__file__).with_name(name) for name in ("model.onnx", "smoother.onnx"))
 # The passes of each buffer, the preferred one first, and their channels.
 PASSES = {
     "color": (("Noisy Image", "Combined"), "RGB"),
@@ -31,10 +30,7 @@ LIGHTS = {
     **dict.fromkeys(("VolumeDir", "VolumeInd", "Emit", "Env")),
     **dict.fromkeys(("Volume Direct", "Volume Indirect", "Emission", "Environment")),
 }
-REST = ""  # the light of Combined that is in none of the passes
 _DARKEST = 1e-3  # smallest color that light is divided by
-# Relative rounding error of a sum of half floats, and the smallest of them.
-_ROUNDING, _SMALLEST = 2.0**-9, 2.0**-24
 _ROWS = 64  # converted at a time, in the cache of a core: in two thirds of the time
 # Blender writes 1e10 where no surface is.
 _FARTHEST, _BRIGHTEST = 1e9, 1e16
@@ -44,58 +40,60 @@ class FrameError(Exception):
     """A file cannot be read, lacks a pass, or cannot be written: one line."""
 
 
-class Denoiser:
-    """Denoises the frames of a shot one after the other, and keeps the graph's state between them."""
+class Graph:
+    """A graph that is run frame by frame, for a shot or for each of its lights, and the state of each between them.
 
-    def __init__(self):
-        self._session, self._smoother = _session(MODEL), None
+    Args:
+        name: that of the file beside this one.
+    """
+
+    def __init__(self, name):
+        import onnxruntime  # imported here because it takes as long as a frame
+
+        path, options = Path(__file__).with_name(f"{name}.onnx"), onnxruntime.SessionOptions()
+        options.log_severity_level = 3
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self._outputs = [each.name for each in self._session.get_outputs()]
-        self._state = {}
+        self._states = {}
 
-    def __call__(self, buffers):
-        """The denoised radiance ``(H, W, 3)`` of buffers ``(H, W, C)`` by name, float32."""
+    def __call__(self, buffers, light=""):
+        """The image ``(H, W, C)`` of buffers ``(H, W, C)`` by name, float32."""
         height, width, _ = buffers["color"].shape
         sizes = {"batch": 1, "height": height, "width": width}
-        feeds = {}
+        feeds, before = {}, self._states.get(light, {})
         for given in self._session.get_inputs():
             if given.name in buffers:
-                feeds[given.name] = _batch(buffers[given.name])
+                feeds[given.name] = np.ascontiguousarray(buffers[given.name].transpose(2, 0, 1)[None], np.float32)
                 continue
-            shape, state = tuple(sizes.get(each, each) for each in given.shape), self._state.get(given.name)
+            shape, state = tuple(sizes.get(each, each) for each in given.shape), before.get(given.name)
             feeds[given.name] = np.zeros(shape, np.float32) if state is None or state.shape != shape else state
         image, *after = self._session.run(self._outputs, feeds)
-        self._state = {name.removeprefix("next_"): each for name, each in zip(self._outputs[1:], after, strict=True)}
+        names = (name.removeprefix("next_") for name in self._outputs[1:])
+        self._states[light] = dict(zip(names, after, strict=True))
         return image[0].transpose(1, 2, 0)
 
-    def split(self, buffers, image, lights):
-        """Split the denoised image ``(H, W, 3)`` into parts for the noisy lights ``(H, W, 3)`` by name."""
-        self._smoother = self._smoother or _session(SMOOTHER)
-        given = {name: _batch(pixels) for name, pixels in {**buffers, "current": image}.items() if name != "motion"}
-        smooth = {
-            name: self._smoother.run(None, {**given, "diffuse": _batch(light)})[0] for name, light in lights.items()
-        }
-        return in_proportion(image, {name: light[0].transpose(1, 2, 0) for name, light in smooth.items()})
 
+class Denoiser:
+    """Denoises the frames of a shot one after the other."""
 
-def in_proportion(image, lights):
-    """Parts of an image ``(H, W, 3)`` in the proportion of lights, or of their means where all lights are black."""
-    lights = {name: light.clip(0) for name, light in lights.items()}
-    total, means = sum(lights.values()), {name: light.mean((0, 1)) for name, light in lights.items()}
-    whole = sum(means.values())
-    parts = {}
-    for name, light in lights.items():
-        mean = np.divide(means[name], whole, out=np.full_like(whole, 1 / len(lights)), where=whole > 0)
-        parts[name] = image * np.divide(light, total, out=np.broadcast_to(mean, light.shape).copy(), where=total > 0)
-    return parts
+    def __init__(self):
+        self._features, self._model, self._light = Graph("features"), Graph("model"), None
 
+    def __call__(self, buffers, lights):
+        """Denoise an image ``(H, W, 3)`` and the parts of it that are lights, ``(H, W, 3)`` by name, float32.
 
-def closed(color, lights):
-    """Lights ``(H, W, 3)`` by name that add up to the color, with what is left as :data:`REST`."""
-    total = sum(lights.values())
-    rest, least = color - total, _ROUNDING * color + (len(lights) + 1) * _SMALLEST
-    none_left = (rest <= least).all()
-    scale = np.divide(color, total, out=np.ones_like(color), where=(total > 0) & ((rest < 0) | none_left))
-    return {name: light * scale for name, light in lights.items()} | {REST: np.where(none_left, 0, rest.clip(0))}
+        Args:
+            buffers: ``(H, W, C)`` by name.
+            lights: the noisy lights, ``(H, W, 3)`` by name.
+        """
+        features = self._features(buffers)
+        buffers = {**buffers, "albedo": features[..., :3], "normal": features[..., 3:]}
+        image = self._model(buffers)
+        if not lights:
+            return image, {}
+        self._light = self._light or Graph("light")
+        buffers |= {"diffuse": image, "total": sum(lights.values())}
+        return image, {name: self._light({**buffers, "light": light}, name) for name, light in lights.items()}
 
 
 def denoise_frame(denoise, source, target, layer, *, blurred=False, lights=False):
@@ -116,50 +114,40 @@ def denoise_frame(denoise, source, target, layer, *, blurred=False, lights=False
     buffers = _buffers(source, parts, layer)
     if blurred:
         buffers["motion"] = np.full_like(buffers["motion"], np.inf)
-    image = denoise(buffers)
-    if not np.isfinite(image).all():
+    passes = _lights(source, parts, layer) if lights else {}
+    noisy = {name: _radiance(pixels[..., places] * color) for name, (pixels, places, color) in passes.items()}
+    image, denoised = denoise(buffers, noisy)
+    if not all(np.isfinite(each).all() for each in (image, *denoised.values())):
         raise FrameError(f"{source}: the result is not finite")
-    if lights:
-        _denoise_lights(denoise, source, parts, layer, buffers, image)
+    if denoised:
+        _put(passes, denoised)
     pixels, places = _channels(source, parts, layer, (RESULT,), "RGB")
     pixels[..., places] = image
     _write(target, parts)
 
 
-def _denoise_lights(denoise, path, parts, layer, buffers, image):
-    """Replace the pixels of the passes of light."""
+def _lights(path, parts, layer):
+    """For each pass of light the pixels of its part, the places of its channels, and the color that divides it."""
     there = {name for spec, _ in parts for name in spec.channelnames}
-    found = {name: color for name, color in LIGHTS.items() if f"{layer}.{name}.R" in there}
+    found = {}
+    for name, color in LIGHTS.items():
+        if f"{layer}.{name}.R" in there:
+            pixels, places = _channels(path, parts, layer, (color or name,), "RGB")
+            divisor = pixels[..., places] if color else np.ones(3, np.float32)
+            found[name] = (*_channels(path, parts, layer, (name,), "RGB"), divisor)
     if not found:
         raise FrameError(f"{path}: expected passes of light, such as Diffuse Direct, found none; render with them")
-    places = {name: _channels(path, parts, layer, (name,), "RGB") for name in found}
-    colors = dict.fromkeys(found, np.ones((1, 1, 3), np.float32))  # of light that is not divided
-    for name, color in found.items():
-        if color is not None:
-            pixels, at = _channels(path, parts, layer, (color,), "RGB")
-            colors[name] = pixels[..., at]
-    noisy = {name: np.nan_to_num(pixels[..., at]) * colors[name] for name, (pixels, at) in places.items()}
-    split = denoise.split(buffers, image, closed(buffers["color"], noisy))
-    del split[REST]
+    return found
+
+
+def _put(passes, lights):
+    """Replace the pixels of the passes of light."""
     # A pass cannot hold light where its color is black: the others get it, so that the sum stays.
-    held = {name: np.where(colors[name] > _DARKEST, light, 0) for name, light in split.items()}
-    total, left = sum(split.values()), sum(held.values())
+    held = {name: np.where(color > _DARKEST, lights[name], 0) for name, (_, _, color) in passes.items()}
+    total, left = sum(lights.values()), sum(held.values())
     scale = np.divide(total, left, out=np.ones_like(total), where=left > 0)
-    for name, (pixels, at) in places.items():
-        pixels[..., at] = held[name] * scale / np.maximum(colors[name], _DARKEST)
-
-
-def _session(path):
-    import onnxruntime  # imported here because it takes as long as a frame
-
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-
-
-def _batch(image):
-    """An image ``(H, W, C)`` as ``(1, C, H, W)``."""
-    return np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
+    for name, (pixels, places, color) in passes.items():
+        pixels[..., places] = held[name] * scale / np.maximum(color, _DARKEST)
 
 
 def _read(path):
@@ -197,7 +185,7 @@ def _buffers(path, parts, layer):
         found[buffer] = pixels[..., places]
     depth = found["depth"]
     found["depth"] = np.where(np.isfinite(depth) & (depth < _FARTHEST), depth, np.inf).astype(np.float32)
-    found["color"] = np.nan_to_num(found["color"], nan=0, posinf=_BRIGHTEST, neginf=0).clip(0, _BRIGHTEST)
+    found["color"] = _radiance(found["color"])
     found["albedo"] = np.nan_to_num(found["albedo"]).clip(0, 1)
     found["normal"] = np.nan_to_num(found["normal"]).clip(-1, 1)
     # Blender's y points up, and where something moves, a background has zeros, as its motion is unknown.
@@ -205,6 +193,10 @@ def _buffers(path, parts, layer):
     known = np.isfinite(motion) & (np.isfinite(found["depth"]) | (motion != 0) | ~motion.any())
     found["motion"] = np.where(known, motion, np.float32(np.inf))
     return found
+
+
+def _radiance(pixels):
+    return np.nan_to_num(pixels, nan=0, posinf=_BRIGHTEST).clip(0, _BRIGHTEST)
 
 
 def _write(path, parts):
