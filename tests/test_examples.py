@@ -23,6 +23,7 @@ from mcdenoise import create_model
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.shards import write_shard
 from mcdenoise.models import describe_weights
+from mcdenoise.train import TrainConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 RENDERERS = Path(__file__).parent / "data" / "renderers"
@@ -310,6 +311,24 @@ def test_a_part_that_fails_leaves_the_others(tmp_path: Path) -> None:
     ends = {each["part"]: each["ended"] for each in json.loads((tmp_path / "summary.json").read_text())}
     assert ends["about"] == "done"
     assert "failed" in ends["ops"]
+
+
+def test_half_of_the_frames_without_a_history_are_seen_with_less_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES / "gpu")
+    train = runpy.run_path(str(EXAMPLES / "gpu" / "train.py"))
+    torch.manual_seed(0)
+    albedo, light = 0.2 + 0.6 * torch.rand(400, 3, 4, 4), torch.rand(400, 3, 4, 4) + 0.1
+    # Noise as large as the light.
+    fixed = torch.cat([2 * light, albedo, albedo, light * albedo], 1)
+    history = torch.cat([2 * light, 2 * light, torch.full((400, 1, 4, 4), 5.0)], 1)
+    frame, reference = train["augmented"](fixed, history, torch.rand(4, 400), TrainConfig(model="wild", crop=4))
+    noise = frame.current * frame.albedo / reference - 1
+    torch.testing.assert_close(noise, noise[:, :1, :1, :1].expand_as(noise), rtol=1e-3, atol=1e-3)
+    noise, young = noise[:, 0, 0, 0], frame.length[:, 0, 0, 0] == 1
+    torch.testing.assert_close(noise[~young], torch.ones(int((~young).sum())), rtol=1e-3, atol=1e-3)
+    less = noise[young][noise[young] < 0.999]
+    assert 0.35 < len(less) / int(young.sum()) < 0.65
+    assert 1 / 16.1 < less.min() < 0.1
 
 
 def test_methods_are_compared_on_takes_with_clean_references(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@
 
 Parts may be added to the folder while it runs. Single frames with their history are drawn and augmented on the device,
 many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one, but each noise level (samples a pixel) as
-often as the square root of its number of frames: most takes have one sample. The learning rate follows the clock. The
+often as the square root of its number of frames, and half of the frames without a history with less noise than they
+were rendered with: most takes have one sample. The learning rate follows the clock. The
 loss of a frame is the logarithm of its error, so that one with little noise counts as much as one with much: what is
 reported of a method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are
 written again at each validation. The same command goes on where an interrupted run was; another one is refused.
@@ -50,6 +51,7 @@ WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
 YOUNG = 0.35  # probability that a frame has no history
+CALM, CALMEST = 0.5, 1 / 16  # probability that such a frame has less noise than was rendered; the least part of it
 FASTER = 8.0  # factor of the learning rate of layers that begin with random weights
 KEPT = ("network", "average", "optimizer")
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
@@ -149,7 +151,7 @@ def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
 
 
 def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Frame, Tensor]:
-    """Colors and axes permuted, light scaled, histories and features dropped, lamps."""
+    """Colors and axes permuted, light scaled, histories, features and a part of the noise dropped, lamps."""
     clips, device = len(fixed), fixed.device
     frame, reference = framed(fixed, history)
     order, axes = (torch.rand(clips, 3, device=device).argsort(1) for _ in range(2))
@@ -169,6 +171,9 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
     young = (rand[1] < YOUNG).reshape(-1, 1, 1, 1)
     color, recent = (torch.where(young, current, image) for image in (color, recent))
     length = torch.where(young, 1, frame.length)
+    calm = young & (torch.rand_like(factor[:, :1]) < CALM)
+    kept, light = CALMEST ** torch.where(calm, torch.rand_like(factor[:, :1]), 0), demodulate(reference, albedo)
+    color, recent, current = (light.lerp(image, kept) for image in (color, recent, current))
     if config.lamps:
         inside, radiance, grey = lamps(reference, rand, config)
         albedo = torch.where(inside, grey, albedo)
