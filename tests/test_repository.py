@@ -20,7 +20,7 @@ PICKLERS = {"cloudpickle", "dill", "joblib", "pickle", "shelve"}
 PICKLED = {".bin", ".ckpt", ".npy", ".npz", ".pickle", ".pkl", ".pt", ".pth"}
 WEIGHTS_LIMIT = 40e6
 FILE_LIMIT = 2e6
-WHEEL_LIMIT = 36e6
+WHEEL_LIMIT = 25e6
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 # Runs a command of the package in a folder, without what only extras install.
 INSTALLED = """

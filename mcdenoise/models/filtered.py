@@ -1,7 +1,7 @@
 """A wrapper that denoises noisy albedo and normal before a method: textures and edges as they would be without noise.
 
-The filters are the large networks for single features that Open Image Denoise 2.5 was published with (Intel
-Corporation, Apache License 2.0). They come with the package.
+The filters are those of Open Image Denoise 2.5 at balanced quality (Intel Corporation, Apache License 2.0). They come
+with the package.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class FilterOf(nn.Module):
     def __init__(self, name: str) -> None:
         super().__init__()
         with outlined():
-            self.network = FeatureFilter(name, "large")
+            self.network = FeatureFilter(name)
         weights = load_file(_WEIGHTS / f"{name}.safetensors")
         for key, layer in self.network.unet.named_modules(remove_duplicate=False):
             for kind in ("weight", "bias") if isinstance(layer, nn.Conv2d) else ():

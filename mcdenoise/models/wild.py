@@ -212,7 +212,7 @@ def _wild(
         tolerance: see :class:`mcdenoise.models.Skipping`.
         features: whether albedo and normal are noisy and to be denoised first, see
             :class:`mcdenoise.models.filtered.Filtered`; by default "auto", but "clean" for the small network, because
-            the filters take ten times as long as it does.
+            the filters take four times as long as it does.
 
     Raises:
         InputError: a setting is out of its range.
@@ -227,7 +227,7 @@ def _wild(
 
 
 for _name, _size, _cost in (
-    ("wild", "base", "125 thousand multiplications a pixel, and 610 to denoise noisy features"),
+    ("wild", "base", "125 thousand multiplications a pixel, and 240 to denoise noisy features"),
     ("wild_small", "small", "62 thousand"),
     ("wild_large", "large", "312 thousand, and as many for features as wild"),
 ):

@@ -53,7 +53,7 @@ def handed(frame: Frame, **settings: object) -> Frame:
 @torch.no_grad()
 def test_the_filters_are_those_of_the_library(name: str) -> None:
     image = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(0))
-    expected = Oidn(threads=1).filtered({name: image}, "high", clean=False)
+    expected = Oidn(threads=1).filtered({name: image}, "balanced", clean=False)
     torch.testing.assert_close(FilterOf(name).eval()(Frame(image))[0].image, expected, rtol=1e-3, atol=1e-3)
 
 
@@ -66,7 +66,7 @@ def test_noise_of_features_is_removed_and_what_has_none_stays() -> None:
         assert isinstance(before, Tensor)
         assert isinstance(after, Tensor)
         assert isinstance(true, Tensor)
-        assert (after - true).abs().mean() < 0.4 * (before - true).abs().mean()
+        assert (after - true).abs().mean() < 0.5 * (before - true).abs().mean()
         # The sky, and the lamp but for its rim.
         assert torch.equal(after[..., :12, :], before[..., :12, :])
         assert torch.equal(after[..., 31:39, 21:29], before[..., 31:39, 21:29])
