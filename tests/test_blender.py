@@ -94,8 +94,8 @@ def test_lights_are_read_as_by_the_package_and_replaced(shot: str, frames: Any, 
 
 @torch.no_grad()
 def test_a_light_is_split_as_by_the_denoiser() -> None:
-    model, size = create_model("wild_small"), (33, 47)
-    split, denoiser = runpy.run_path(str(EXTENSION / "build.py"))["Light"](model).eval(), Denoiser(model)
+    build, model, size = runpy.run_path(str(EXTENSION / "build.py")), create_model("wild_small"), (33, 47)
+    split, denoiser = build["Light"](model).eval(), Denoiser(model, precision="float32")
     states: dict[str, Any] = {}
     for _ in range(3):
         # In places darker than the lights, in others with light of its own.

@@ -7,10 +7,10 @@
 Parts may be added to the folder while it runs. Single frames with their history are drawn and augmented on the device,
 many at once, as :class:`mcdenoise.train.ClipSampler` draws clips one by one, but each noise level (samples a pixel) as
 often as the square root of its number of frames, and half of the frames without a history with less noise than they
-were rendered with: most takes have one sample. The learning rate follows the clock. The
-loss of a frame is the logarithm of its error, so that one with little noise counts as much as one with much: what is
-reported of a method is the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are
-written again at each validation. The same command goes on where an interrupted run was; another one is refused.
+were rendered with: most takes have one sample. The learning rate follows the clock. The loss of a frame is the
+logarithm of its error, so that one with little noise counts as much as one with much: what is reported of a method is
+the geometric mean of ratios. OUT has the averaged weights, the log and a checkpoint, which are written again at each
+validation. The same command goes on where an interrupted run was; another one is refused.
 """
 
 import argparse
