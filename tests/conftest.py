@@ -1,3 +1,4 @@
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,6 +50,14 @@ def seed() -> Iterator[None]:
     torch.manual_seed(0)
     yield
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def no_finalizers() -> Iterator[None]:
+    """No garbage is collected while nested text uses up the stack: a finalizer of any test before would fail there."""
+    gc.disable()
+    yield
+    gc.enable()
 
 
 @pytest.fixture

@@ -104,6 +104,7 @@ LINES = [b'{"first_step": 0}', b'{"step": 10, "validation": {"SMAPE": 0.5}}', b'
 DAMAGE = [b'{"step": 5', b"\xff\xfe\x00", bytes(100), b'{"step": "\xe4"}', b"[" * 100_000, b"null", b'{"step": null}']
 
 
+@pytest.mark.usefixtures("no_finalizers")
 def test_a_log_goes_on_without_what_is_damaged_in_it(tmp_path: Path) -> None:
     path, run = tmp_path / "log.jsonl", RunFolder(tmp_path)
     for place in range(4):

@@ -102,6 +102,7 @@ def test_whatever_is_changed_it_is_refused_in_one_line_or_still_makes_sense(resu
     assert counts[1] > 100
 
 
+@pytest.mark.usefixtures("no_finalizers")
 def test_no_text_is_too_much(results: Results, tmp_path: Path) -> None:
     results.write(tmp_path)
     path = tmp_path / "results.json"

@@ -195,6 +195,7 @@ def described(path: Path, name: str, **values: Any) -> dict[str, bytes | None]:
         return {f"{name}/.zarray": json.dumps(json.loads(file.read(f"{name}/.zarray")) | values).encode()}
 
 
+@pytest.mark.usefixtures("no_finalizers")
 def test_compressed_bombs_and_false_sizes_are_refused_before_memory_is_allocated(tmp_path: Path) -> None:
     path = write(tmp_path / "frame0.zip", arrays(0))
     huge = [4, 2**14, 2**14, 6]

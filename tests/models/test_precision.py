@@ -66,6 +66,7 @@ def test_a_measurement_is_kept_for_the_machine_that_made_it(
     assert measured == [3.0]
 
 
+@pytest.mark.usefixtures("no_finalizers")
 @pytest.mark.parametrize(
     "content",
     [b"", b"{", b"[2.0]", b'"text"', b"\xff", b"[" * 100_000, "own", '{"KEY": NaN}', '{"KEY": -1}', '{"KEY": "x"}'],
