@@ -123,7 +123,8 @@ def reproject(
     dtype = torch.promote_types(previous.dtype, torch.float32)
     there = Surface(*(None if buffer is None else buffer.to(dtype) for buffer in there))
     if motion is None:
-        kept = torch.ones_like(previous[:, :1], dtype=torch.bool) & _alike(here, there, position_limit, normal_limit)
+        kept = torch.ones_like(previous[:, :1], dtype=torch.bool)
+        kept = _alike(kept, here, there, position_limit, normal_limit)
         return torch.where(kept, previous, 0), kept.to(previous.dtype)
     height, width = previous.shape[-2:]
 
@@ -146,7 +147,7 @@ def reproject(
                 tap = stack.gather(2, index.expand(-1, stack.shape[1], -1)).reshape(*stack.shape[:2], height, width)
                 parts = iter(torch.split(tap, [buffer.shape[1] for buffer in tested], 1))
                 tap_surface = Surface(*(None if buffer is None else next(parts) for buffer in there))
-            kept = kept & _alike(here, tap_surface, position_limit, normal_limit)
+            kept = _alike(kept, here, tap_surface, position_limit, normal_limit)
             bilinear = (fx if dx else 1 - fx) * (fy if dy else 1 - fy)
             if here.label is not None:
                 alike.append(kept & (tap_surface.label == here.label.to(dtype)))
@@ -292,8 +293,10 @@ def _pixel_grid(height: int, width: int, device: torch.device, dtype: torch.dtyp
     return create_meshgrid(height, width, normalized_coordinates=False, device=device, dtype=dtype).permute(0, 3, 1, 2)
 
 
-def _alike(here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None) -> Tensor | bool:
-    kept: Tensor | bool = True
+def _alike(
+    kept: Tensor, here: Surface, tap: Surface, position_limit: float | None, normal_limit: float | None
+) -> Tensor:
+    """The kept pixels in which both are the same surface."""
     if here.normal is not None and tap.normal is not None:
         limit = NORMAL_LIMIT_SQUARED if normal_limit is None else normal_limit
         kept = kept & ((tap.normal - here.normal).square().sum(1, keepdim=True) <= limit)

@@ -229,10 +229,14 @@ def test_a_graph_needs_no_numba() -> None:
 # The warnings are torch's own, about sizes that become constants.
 @pytest.mark.filterwarnings("ignore:.*jit.*:DeprecationWarning", "ignore::torch.jit.TracerWarning")
 @pytest.mark.parametrize("trace", [lambda f, x: make_fx(f)(*x), torch.jit.trace], ids=["make_fx", "jit"])
-def test_what_is_traced_is_plain_torch(trace: Callable[..., Any]) -> None:
+@pytest.mark.parametrize(
+    "call",
+    [lambda a, b: ops.kernel_conv(a, b), lambda a, b: ops.accumulate(a, b[:, :3], b[:, 3:4], b[:, 4:6])[0]],
+    ids=["kernel_conv", "accumulate"],
+)
+def test_what_is_traced_is_plain_torch(trace: Callable[..., Any], call: Callable[..., Tensor]) -> None:
     first, second = ((torch.rand(1, 3, 96, 96), torch.rand(1, 9, 96, 96)) for _ in range(2))
-    traced = trace(lambda image, kernel: ops.kernel_conv(image, kernel), first)(*second)
-    torch.testing.assert_close(traced, by("torch", ops.kernel_conv)(*second))
+    torch.testing.assert_close(trace(call, first)(*second), by("torch", call)(*second))
 
 
 ACCUMULATE, REPROJECT = (next(op for op in OPS if op.name == name) for name in ("accumulate", "reproject"))
