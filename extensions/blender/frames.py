@@ -41,7 +41,7 @@ class FrameError(Exception):
 
 
 class Graph:
-    """A graph that is run frame by frame, for a shot or for each of its lights, and the state of each between them.
+    """A graph of a step: from a frame and the state after the frame before it.
 
     Args:
         name: that of the file beside this one.
@@ -54,13 +54,12 @@ class Graph:
         options.log_severity_level = 3
         self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self._outputs = [each.name for each in self._session.get_outputs()]
-        self._states = {}
 
-    def __call__(self, buffers, light=""):
-        """The image ``(H, W, C)`` of buffers ``(H, W, C)`` by name, float32."""
+    def __call__(self, buffers, before=None):
+        """The image ``(H, W, C)`` of buffers ``(H, W, C)`` by name, float32; and the state after it."""
         height, width, _ = buffers["color"].shape
         sizes = {"batch": 1, "height": height, "width": width}
-        feeds, before = {}, self._states.get(light, {})
+        feeds, before = {}, before or {}
         for given in self._session.get_inputs():
             if given.name in buffers:
                 feeds[given.name] = np.ascontiguousarray(buffers[given.name].transpose(2, 0, 1)[None], np.float32)
@@ -69,8 +68,7 @@ class Graph:
             feeds[given.name] = np.zeros(shape, np.float32) if state is None or state.shape != shape else state
         image, *after = self._session.run(self._outputs, feeds)
         names = (name.removeprefix("next_") for name in self._outputs[1:])
-        self._states[light] = dict(zip(names, after, strict=True))
-        return image[0].transpose(1, 2, 0)
+        return image[0].transpose(1, 2, 0), dict(zip(names, after, strict=True))
 
 
 class Denoiser:
@@ -78,6 +76,7 @@ class Denoiser:
 
     def __init__(self):
         self._features, self._model, self._light = Graph("features"), Graph("model"), None
+        self._state, self._states = None, {}
 
     def __call__(self, buffers, lights):
         """Denoise an image ``(H, W, 3)`` and the parts of it that are lights, ``(H, W, 3)`` by name, float32.
@@ -86,14 +85,20 @@ class Denoiser:
             buffers: ``(H, W, C)`` by name.
             lights: the noisy lights, ``(H, W, 3)`` by name.
         """
-        features = self._features(buffers)
+        features, _ = self._features(buffers)
         buffers = {**buffers, "albedo": features[..., :3], "normal": features[..., 3:]}
-        image = self._model(buffers)
+        image, self._state = self._model(buffers, self._state)
         if not lights:
             return image, {}
         self._light = self._light or Graph("light")
         buffers |= {"diffuse": image, "total": sum(lights.values())}
-        return image, {name: self._light({**buffers, "light": light}, name) for name, light in lights.items()}
+        denoised, before, self._states = {}, self._states, {}
+        for name, light in lights.items():
+            denoised[name], after = self._light({**buffers, "light": light}, before.get(name))
+            # The history of the image is the same for all: only what is carried with it is a light's own.
+            first = next(iter(self._states.values()), after)
+            self._states[name] = {key: after[key] if "carried" in key else each for key, each in first.items()}
+        return image, denoised
 
 
 def denoise_frame(denoise, source, target, layer, *, blurred=False, lights=False):
