@@ -137,8 +137,10 @@ def _lights(path, parts, layer):
     found = {}
     for name, color in LIGHTS.items():
         if f"{layer}.{name}.R" in there:
-            pixels, places = _channels(path, parts, layer, (color or name,), "RGB")
-            divisor = pixels[..., places] if color else np.ones(3, np.float32)
+            divisor = np.ones(3, np.float32)
+            if color:
+                pixels, places = _channels(path, parts, layer, (color,), "RGB")
+                divisor = pixels[..., places]
             found[name] = (*_channels(path, parts, layer, (name,), "RGB"), divisor)
     if not found:
         raise FrameError(f"{path}: expected passes of light, such as Diffuse Direct, found none; render with them")

@@ -212,7 +212,7 @@ def _wild(
         tolerance: see :class:`mcdenoise.models.Skipping`.
         features: whether albedo and normal are noisy and to be denoised first, see
             :class:`mcdenoise.models.filtered.Filtered`; by default "auto", but "clean" for the small network, because
-            the filters take four times as long as it does.
+            the filters take almost twice as long as it does.
 
     Raises:
         InputError: a setting is out of its range.
