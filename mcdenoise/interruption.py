@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import os
 import shutil
 import signal
@@ -19,20 +18,14 @@ _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 # The environment variable for the option -P of Python.
 _SAFE_PATH = "PYTHONSAFEPATH"
 _NO_WARNING = "ignore:resource_tracker:UserWarning"
-# Time in seconds for an orderly shutdown.
+# Longest time in seconds for what has begun.
 _GRACE = 1.25
 # Incomplete files and folders, to be removed if the process ends early.
 _unfinished: set[Path] = set()
 
 
-class _Starts:
-    """Whether a process is being started, and whether a signal came meanwhile; another thread may get it."""
-
-    active = False
-    interrupted = False
-
-
-_starts = _Starts()
+# Held while a process is started: one that loses its parent half-way prints why it cannot start.
+_starting = threading.Lock()
 
 
 def start_resource_tracker() -> None:
@@ -92,22 +85,16 @@ def deaf_children() -> Iterator[None]:
     """Start child processes inside this block that ignore Ctrl+C from the beginning, with a :func:`safe_path`.
 
     A terminal sends Ctrl+C to all processes of a command. The main process tells its children what to do; tracebacks
-    from children that are still importing modules would not help. A signal that this process receives inside the block
-    interrupts it at the end of the block, because a half-started process would print why it cannot start.
+    from children that are still importing modules would not help.
     """
     masks = hasattr(signal, "pthread_sigmask")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else set()
-    _starts.active, _starts.interrupted = True, False
     try:
-        with safe_path():
+        with _starting, safe_path():
             yield
     finally:
-        _starts.active = False
         if masks:
-            # A signal that came meanwhile is delivered now.
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        if _starts.interrupted:
-            raise KeyboardInterrupt
 
 
 def prepare_worker() -> None:
@@ -139,103 +126,66 @@ def _end_with_driver() -> None:
         _end(1)
 
 
-class Interruption:
-    """Handles SIGINT, SIGTERM and SIGHUP: prints one line to stderr, and exits with 128 plus the signal's number.
+def heed_signals(name: str) -> None:
+    """End this process at SIGINT, SIGTERM or SIGHUP: with one line on stderr, and 128 plus the signal's number.
 
-    The main thread gets a ``KeyboardInterrupt``, so that all ``with`` and ``finally`` blocks run. But native code, or
-    Python code called by it, may swallow the exception, convert or print it, or not return for minutes. Therefore
-    nothing else is printed afterwards; the exit status is that of the signal whatever happens to the exception; and if
-    the shutdown takes too long, a thread removes incomplete files and ends the process.
+    A thread does this at once, whatever the main thread does: native code may not return for minutes, and may swallow
+    an exception. So no ``with`` or ``finally`` block runs; what must not stay behind is :func:`unfinished`. Signals
+    that the process was told to ignore, as by ``nohup``, stay ignored. Call it in the main thread.
 
     Args:
         name: name of the command, printed in the line.
-
-    Attributes:
-        number: number of the received signal; 0 if there was none.
-        listening: whether a ``KeyboardInterrupt`` would be caught. If not, the process ends at once.
     """
+    numbers = [getattr(signal, each) for each in _WORDS if hasattr(signal, each)]
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+    before = {number: signal.signal(number, _wait) for number in numbers if signal.getsignal(number) in defaults}
+    threading.Thread(target=_watch, args=(name, reading, set(before)), daemon=True).start()
 
-    def __init__(self, name: str) -> None:
-        self.number = 0
-        self.listening = False
-        self._line = f"mcdenoise{f' {name}' if name else ''}: {{}}; finished files are kept\n"
-        self._said = threading.Lock()
-        self._before: dict[int, signal._HANDLER] = {}
-        self._pipe: tuple[int, int] | None = None
-
-    def start(self) -> None:
-        """Install the handlers; signals that the process was told to ignore, as by ``nohup``, stay ignored."""
-        # Python allows this in the main thread only.
-        if threading.current_thread() is not threading.main_thread():
-            return
-        self._pipe = reading, writing = os.pipe()
-        os.set_blocking(writing, False)
-        threading.Thread(target=self._watch, args=(reading,), daemon=True).start()
-        signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        for number in [getattr(signal, name) for name in _WORDS if hasattr(signal, name)]:
-            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-                self._before[number] = signal.signal(number, self._heard)
-        # Runs last before the interpreter shuts down: all work is done then.
-        atexit.register(self._ignore)
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=self.stop)
-
-    def stop(self) -> None:
-        """Restore the previous handlers."""
-        if self._pipe is None:
-            return
+    def restore() -> None:
         signal.set_wakeup_fd(-1)
-        for number, handler in self._before.items():
+        for number, handler in before.items():
             signal.signal(number, handler)
-        atexit.unregister(self._ignore)
-        # Closing the pipe ends the thread.
-        os.close(self._pipe[1])
-        self._pipe = None
 
-    def _heard(self, number: int, frame: FrameType | None) -> None:
-        again, self.number = bool(self.number), number
-        self._say(number)
-        # An import has nothing to clean up, and modules rarely handle exceptions while they are imported.
-        if again or not self.listening or _is_importing(frame):
-            _end(128 + number)
-        if _starts.active:
-            _starts.interrupted = True
-            return
-        raise KeyboardInterrupt
-
-    def _ignore(self) -> None:
-        if self._pipe is not None:
-            for number in self._before:
-                signal.signal(number, signal.SIG_IGN)
-
-    def _watch(self, reading: int) -> None:
-        """Wait for a signal in a separate thread, which works even if the main thread is blocked."""
-        while heard := os.read(reading, 1):
-            if heard[0] in self._before:
-                time.sleep(_GRACE)
-                self._say(heard[0])
-                _end(128 + heard[0])
-        os.close(reading)
-
-    def _say(self, number: int) -> None:
-        """Print the line once, and suppress all further output."""
-        # A handler may interrupt itself.
-        if not self._said.acquire(blocking=False):
-            return
-        # The terminal may have been closed.
-        with suppress(OSError):
-            # Restore the cursor, which a progress bar hides.
-            cursor = "\x1b[?25h\n" if os.isatty(2) else ""
-            os.write(2, f"{cursor}{self._line.format(_WORDS[signal.Signals(number).name])}".encode())
-        with suppress(OSError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, 2)
-            os.close(nowhere)
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=restore)
 
 
-def _is_importing(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
+def _wait(number: int, frame: FrameType | None) -> None:
+    """Keep the main thread from doing anything more, except to start a process that it has begun to start."""
+    while not _starting.locked():
+        time.sleep(1)
+
+
+def _watch(name: str, reading: int, numbers: set[int]) -> NoReturn:
+    """Wait for one of these signals in a separate thread, which works even if the main thread is blocked."""
+    while (number := os.read(reading, 1)[0]) not in numbers:
+        pass
+    _say(f"mcdenoise{f' {name}' if name else ''}: {_WORDS[signal.Signals(number).name]}; finished files are kept\n")
+    # The main thread may be writing to the same stream.
+    flushing = threading.Thread(target=_flush, daemon=True)
+    flushing.start()
+    flushing.join(_GRACE)
+    _starting.acquire(timeout=_GRACE)
+    _end(128 + number)
+
+
+def _flush() -> None:
+    # Its reader may be gone, or the disk full.
+    with suppress(OSError, ValueError, AttributeError):
+        sys.stdout.flush()
+
+
+def _say(line: str) -> None:
+    """Print a line, and suppress all further output."""
+    # The terminal may have been closed.
+    with suppress(OSError):
+        # Restore the cursor, which a progress bar hides.
+        cursor = "\x1b[?25h\n" if os.isatty(2) else ""
+        os.write(2, f"{cursor}{line}".encode())
+    with suppress(OSError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)

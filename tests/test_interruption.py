@@ -16,15 +16,14 @@ SECONDS = 10.0
 # A command that says when it obeys signals, a moment after the interpreter does.
 OBEYING = """
 from mcdenoise import cli
-from mcdenoise.interruption import Interruption
 
-start = Interruption.start
+heed = cli.heed_signals
 
-def begin(self):
-    start(self)
+def begin(name):
+    heed(name)
     print("begun", flush=True)
 
-Interruption.start = begin
+cli.heed_signals = begin
 cli.main()
 """
 # A further command, whose work is one statement.

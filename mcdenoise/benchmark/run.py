@@ -208,8 +208,7 @@ class _SceneRun:
             self._failures, self._lacking = {method.name: reason for method in self._made.methods}, set()
             self._scene = replace(self._scene, pictures=[])
             shutil.rmtree(self._folder / IMAGES / self._scene.name, ignore_errors=True)
-        finally:
-            self._written.unlink(missing_ok=True)
+        self._written.unlink(missing_ok=True)
         return self._scene, [self._cell(method) for method in self._made.methods]
 
     def _warm_up(self, on_step: Callable[[], None]) -> None:

@@ -19,7 +19,7 @@ from typing import Any, get_type_hints
 
 from mcdenoise.cli._stdout import forgiving_stdout
 from mcdenoise.errors import InputError, printable
-from mcdenoise.interruption import Interruption
+from mcdenoise.interruption import heed_signals
 from mcdenoise.threads import wait_passively
 
 Command = Callable[..., int | None]
@@ -69,21 +69,8 @@ def main(arguments: list[str] | None = None) -> None:
         # Registered first, and so called last.
         atexit.register(_leave, statuses)
         warnings.showwarning = _warn
-    interruption = Interruption(name)
-    interruption.start()
-    try:
-        interruption.listening = True
-        status = _status(name, arguments)
-    except BaseException:
-        # After a signal, this is the exception that it raised, or one that followed from it.
-        if not interruption.number:
-            raise
-        status = 0
-    finally:
-        interruption.listening = False
-        if not of_process and not interruption.number:
-            interruption.stop()
-    statuses.append(128 + interruption.number if interruption.number else status)
+        heed_signals(name)
+    statuses.append(_status(name, arguments))
     sys.exit(*statuses)
 
 
@@ -115,7 +102,7 @@ def _status(name: str, arguments: list[str]) -> int:
         print(f"mcdenoise{f' {name}' if name else ''}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        # Code can raise this without a signal.
+        # Signals of a process that is not the command's own are left as they were.
         print(f"mcdenoise {name}: interrupted; finished files are kept", file=sys.stderr)
         return 130
 

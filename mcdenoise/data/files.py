@@ -102,7 +102,8 @@ def held(folder: Path, work: str, *, wait: bool = False) -> Iterator[None]:
             file.write(f"process {os.getpid()} of {platform.node()} at work in it")
             file.flush()
         try:
-            yield
+            with unfinished(path):
+                yield
         finally:
             if fcntl is not None:
                 with suppress(OSError):

@@ -81,7 +81,7 @@ def run_film(
     """Denoise a film: look at every shot, denoise the frames that are not finished, and look again.
 
     A frame, a piece or a shot that fails is named in the result, and all others go on. The same call again resumes the
-    film, however the last one ended. ``OUT/film.json`` is written at the end, also after an error or an interruption.
+    film, however the last one ended. ``OUT/film.json`` is written at the start, and at the end, also after an error.
 
     Args:
         shots: in the order in which they are started.
@@ -116,6 +116,7 @@ def run_film(
         make_folder(out / RECORDS)
         with held(out / RECORDS, "film"):
             tasks.extend(_shot(each, out, piece, tasks, on_shot) for each in results)
+            write_json(out / "film.json", _as_json(results))
             try:
                 run_tasks(engine, tasks, count)
             finally:

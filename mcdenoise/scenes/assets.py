@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.files import make_folder
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import unfinished
 from mcdenoise.reading import check_file, read_bytes
 from mcdenoise.user_cache import cache_file
 
@@ -195,7 +196,7 @@ def open_assets(folder: Path, say: Callable[[str], None]) -> Assets:
         if target.is_dir():
             continue
         try:
-            with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work:
+            with tempfile.TemporaryDirectory(dir=folder, prefix=".fetch-") as work, unfinished(Path(work)):
                 found = client(Path(work), package)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 found.rename(target)

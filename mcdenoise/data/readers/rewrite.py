@@ -22,6 +22,7 @@ from mcdenoise.data.files import atomic_path, cannot_write
 from mcdenoise.data.images import FORMATS, Image, Part, read_image_header, read_last_rows, read_picture
 from mcdenoise.data.radiance import encode
 from mcdenoise.errors import first_line
+from mcdenoise.interruption import unfinished
 
 # Names of the channels that DWA compression rounds, and its usual level.
 _DWA_ROUNDS, _DWA_LEVEL = {"r", "g", "b", "y", "ry", "by"}, 45
@@ -75,9 +76,10 @@ def _write_exr(
         expected = read_image_header(source).parts
         # The library skips unreadable parts with a printed warning. Suppressing that would also suppress the output of
         # all other threads.
-        shutil.copyfile(source, copy)
-        originals = _make_readable(copy)
-        file = OpenEXR.File(str(copy), separate_channels=True)
+        with unfinished(copy):
+            shutil.copyfile(source, copy)
+            originals = _make_readable(copy)
+            file = OpenEXR.File(str(copy), separate_channels=True)
         whole = len(file.parts) == len(expected) and all(map(_is_whole, file.parts, expected))
     except Exception as error:
         return f"{source} cannot be read again: {first_line(error)}"

@@ -26,6 +26,7 @@ from mcdenoise.data.readers.files import SKY, as_tensor, far_points
 from mcdenoise.data.readers.layers import layers_of, read_files
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
+from mcdenoise.interruption import unfinished
 from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.render.folder import SequenceFolder, write_reference
@@ -149,7 +150,7 @@ def render_cycles(
             progress(done, total)
 
     advance(0)
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as place, unfinished(Path(place)):
         file = Path(place) / "shot.exr"
         if noisy or clean:
             description.save(Path(place))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError, first_line, import_optional
+from mcdenoise.interruption import unfinished
 from mcdenoise.scenes.assets import Mesh
 
 Scene: TypeAlias = str | Path | Mapping[str, Any]
@@ -134,7 +135,7 @@ def load_scene(mi: Any, scene: Scene, merge: bool) -> Any:
             )
     try:
         if isinstance(scene, Mapping):
-            with tempfile.TemporaryDirectory(prefix="mcdenoise-") as folder:
+            with tempfile.TemporaryDirectory(prefix="mcdenoise-") as folder, unfinished(Path(folder)):
                 loaded = mi.load_dict(_to_mitsuba(mi, scene, Path(folder)), optimize=merge)
         else:
             loaded = mi.load_file(str(scene), optimize=merge)
