@@ -54,7 +54,7 @@ PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SMAPE = "linear SMAPE"
 SAME_INPUT = "joint bilateral of the accumulated image"
 SEEDS = (1, 2, 3)
-KINDS = ("random scenes", "four times the steps", "leave one out")
+KINDS = ("random scenes", "leave one out")
 Errors = dict[str, float]  # by "protocol metric", and SMAPE of linear radiance
 
 
@@ -260,7 +260,7 @@ def _convolutions(model: Any, frame: Frame) -> float:
 
 
 def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[str, list[Errors | str]]]:
-    """Rows of variants, trained on random scenes with three seeds, trained for longer, and with one scene held out."""
+    """Rows of variants, trained on random scenes with three seeds, and with one scene held out."""
     options = measured.options
     columns = [f"{kind}, {name} PSNR / SSIM" for kind in KINDS for name in PROTOCOL_NAMES]
     found = Table([["network", "parameters", columns[0], "seeds, PSNR", *columns[1:]]])
@@ -276,11 +276,8 @@ def ablation(measured: Measured, variants: dict[str, str]) -> tuple[Table, dict[
         scenes[name] = [measured.average(own) for own in zip(*seeds, strict=True)]
         each = sorted(own["strict PSNR"] for own in means if not isinstance(own, str))
         spread = f"{each[0]:.2f} .. {each[-1]:.2f}" if len(each) == len(SEEDS) else "-"
-        longer = measured.average(_seed(measured, options.runs / "ablations" / f"{run}-longer"))
         strict, *others = [
-            cell
-            for errors in (measured.average(means), longer, measured.average(folds))
-            for cell in found.cells(errors)
+            cell for errors in (measured.average(means), measured.average(folds)) for cell in found.cells(errors)
         ]
         found.rows.append([name, _parameters(options.runs, run), strict, spread, *others])
     return found, scenes
