@@ -330,6 +330,17 @@ def test_half_of_the_frames_without_a_history_are_seen_with_less_noise(monkeypat
     assert 1 / 16.1 < less.min() < 0.1
 
 
+def test_half_of_the_lamps_are_stars(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES / "gpu")
+    train, config = runpy.run_path(str(EXAMPLES / "gpu" / "train.py")), TrainConfig(model="wild", crop=64, lamps=1.0)
+    inside, radiance, _ = train["lamps"](torch.full((400, 3, 64, 64), 0.5), torch.zeros(4, 400), config)
+    sides = [inside.any(2).sum(-1), inside.any(3).sum(-1)]
+    stars = (inside.sum((1, 2, 3)) != (sides[0] * sides[1])[:, 0]).float().mean()
+    assert 0.35 < stars < 0.6
+    lit = radiance[inside.expand_as(radiance)] / 0.5
+    assert 0.7 < lit.min() < 1 < 500 < lit.max() < 1300
+
+
 def test_methods_are_compared_on_takes_with_clean_references(tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="Open Image Denoise is in the extra mcdenoise[peers]")
     generator, truth = np.random.default_rng(0), np.full((4, 3, 48, 64), 0.5, np.float32)

@@ -52,6 +52,7 @@ RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
 YOUNG = 0.35  # probability that a frame has no history
 CALM, CALMEST = 0.5, 1 / 16  # probability that such a frame has less noise than was rendered; the least part of it
+STRANGE = 0.04  # probability that a frame has the features of another one, whose edges its light does not have
 FASTER = 8.0  # factor of the learning rate of layers that begin with random weights
 KEPT = ("network", "average", "optimizer")
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
@@ -174,6 +175,10 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
     calm = young & (torch.rand_like(factor[:, :1]) < CALM)
     kept, light = CALMEST ** torch.where(calm, torch.rand_like(factor[:, :1]), 0), demodulate(reference, albedo)
     color, recent, current = (light.lerp(image, kept) for image in (color, recent, current))
+    strange = torch.rand_like(factor[:, :1]) < STRANGE
+    theirs, normal = (torch.where(strange, image.roll(1, 0), image) for image in (albedo, normal))
+    color, recent, current = (demodulate(remodulate(image, albedo), theirs) for image in (color, recent, current))
+    albedo = theirs
     if config.lamps:
         inside, radiance, grey = lamps(reference, rand, config)
         albedo = torch.where(inside, grey, albedo)
@@ -189,18 +194,23 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
 
 
 def lamps(reference: Tensor, rand: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """Where lamps are, their radiance and albedo; as many are small, down to single pixels, as are large."""
+    """Where lamps are, their radiance and albedo.
+
+    In half of the images it is one lamp, down to a single pixel; in the others single pixels all over it: stars, or the
+    windows of a distant town.
+    """
     clips, side = len(reference), torch.arange(config.crop, device=reference.device)
-    own = torch.rand(7, clips, device=reference.device)
+    own = torch.rand(8, clips, 1, 1, 1, device=reference.device)
+    single = torch.rand(2, clips, 1, config.crop, config.crop, device=reference.device)
     sizes = (config.crop / 3) ** own[:2]
     starts = own[2:4] * (config.crop - sizes)
-    rows, columns = ((side >= s[:, None]) & (side < (s + n)[:, None]) for s, n in zip(starts, sizes, strict=True))
-    inside = (rows[:, :, None] & columns[:, None, :] & (rand[2] < config.lamps)[:, None, None])[:, None]
+    rows, columns = ((side >= s) & (side < s + n) for s, n in zip(starts, sizes, strict=True))
+    many, grey = own[4] < 0.5, own[6] * (own[7] > 0.5)
+    inside = torch.where(many, single[0] < 0.03 * 0.01 ** own[5], rows.mT & columns)
+    inside &= (rand[2] < config.lamps).reshape(-1, 1, 1, 1)
+    brightness = torch.where(many, 1000.0 ** single[1], 30.0 ** own[5])
     tint = 0.7 + 0.6 * torch.rand(clips, 3, 1, 1, device=reference.device)
-    mean = reference.mean((1, 2, 3), keepdim=True)
-    radiance = mean * torch.pow(30.0, own[4]).reshape(-1, 1, 1, 1) * tint
-    grey = (own[5] * (own[6] > 0.5)).reshape(-1, 1, 1, 1)
-    return inside, radiance, grey
+    return inside, reference.mean((1, 2, 3), keepdim=True) * brightness * tint, grey
 
 
 def errors(image: Tensor, reference: Tensor, config: TrainConfig) -> Tensor:
