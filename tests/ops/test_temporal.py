@@ -4,7 +4,7 @@ import torch
 from reference_cases import by, draw
 from torch import Tensor
 
-from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject, use
+from mcdenoise.ops import Surface, motion_from_position, reproject, use
 from mcdenoise.ops._backend import BACKENDS
 
 INF, NAN = torch.inf, torch.nan
@@ -22,20 +22,6 @@ def vectors(rows: list[list[tuple[float, ...]]]) -> Tensor:
 
 def still(height: int, width: int, batch: int = 1) -> Tensor:
     return torch.zeros(batch, 2, height, width, dtype=torch.float64)
-
-
-def test_a_still_camera_averages() -> None:
-    frames = draw(12, 3, 5, 7)
-    history, length = frames[:1], torch.ones(1, 1, 5, 7, dtype=torch.float64)
-    expected = history
-    for n in range(2, 13):
-        frame = frames[n - 1 : n]
-        history, length = accumulate(frame, history, length, still(5, 7), alpha_min=1e-3)
-        expected = torch.lerp(expected, frame, 1 / torch.full((1, 1, 5, 7), n, dtype=torch.float64))
-        # They are equal to the last bit: nothing is lost by reprojecting onto the same pixel.
-        assert torch.equal(history, expected)
-        assert torch.equal(length, torch.full_like(length, n))
-    torch.testing.assert_close(history, frames.mean(0, keepdim=True), rtol=1e-12, atol=0)
 
 
 def test_without_a_surface_it_is_kornias_remap_inside_the_image() -> None:
