@@ -19,7 +19,7 @@ from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.random.builder import place, rotate
-from mcdenoise.scenes.render import Camera, render_sequence, view_projection
+from mcdenoise.scenes.render import Camera, render_sequence
 from mcdenoise.scenes.render import frames as render_frames
 from mcdenoise.scenes.render.loading import LLVM, first_working
 
@@ -213,13 +213,6 @@ def test_variants_agree_on_what_moves(moving: Path, tmp_path: Path) -> None:
     for name in ("world_position2", "previous_position2", "albedo2"):
         different = np.abs(read(folder, name) - read(moving, name)).max(axis=-1) > 2e-3
         assert different.mean() < 0.01, name
-
-
-def test_view_projection_of_a_point_to_the_right_and_above() -> None:
-    camera = Camera.look_at((0, 0, 5), (0, 0, 0), fov_x=90)
-    clip = np.array((1.0, 0.5, 3.0, 1.0)) @ view_projection(camera, 200, 100, near=1, far=9)
-    u, v = (clip[:2] / clip[3] + 1) / 2
-    np.testing.assert_allclose((u, v, clip[3]), (0.75, 0.25, 2.0))
 
 
 @pytest.mark.parametrize(

@@ -388,16 +388,6 @@ def test_a_still_frame_needs_no_reprojection_to_the_last_bit(size: tuple[int, in
     assert seen.length.max() == 14
 
 
-def test_the_last_frame_is_no_history() -> None:
-    history = Shot()
-    color = torch.rand(1, 3, HEIGHT, WIDTH)
-    history.update(still(color))
-    last = history.update(still(color), last=True)
-    assert last.length.unique().tolist() == [2]
-    assert history.state[0] is None
-    assert history.update(still(color)).reset == "first frame"
-
-
 CUTS = {
     "cut": {"normal": torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)},
     "size change": {},

@@ -87,17 +87,6 @@ class TestEachTap:
             assert weight[0, 0, 0, 0].item() == kept
 
 
-def test_points_behind_the_camera_have_no_motion_and_no_history() -> None:
-    position = vectors([[(0.0, 0.0, 4.0), (0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (INF, 0.0, 4.0), (NAN, 0.0, 4.0)]])
-    # Row vectors: clip x and y are those of the point, and w is z.
-    matrix = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64))
-    matrix[2, 3] = 1
-    motion = motion_from_position(position, matrix[None])
-    assert motion.isfinite().flatten(2).tolist() == [[[True, False, False, False, False]] * 2]
-    _, weight = reproject(draw(1, 1, 1, 5), motion)
-    assert weight.flatten().tolist()[1:] == [0.0] * 4
-
-
 def test_no_motion_is_one_of_zeros_to_the_last_bit() -> None:
     previous, here = draw(1, 3, 5, 6).requires_grad_(), draw(1, 1, 5, 6, seed=1) + 1
     surfaces = Surface(depth=here), Surface(depth=here * torch.tensor([1.0, 1.5]).repeat(3))
