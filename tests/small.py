@@ -8,6 +8,4 @@ from mcdenoise import create_model
 
 def small_model() -> nn.Module:
     torch.manual_seed(0)
-    model = create_model("cascaded", width=8)
-    assert isinstance(model, nn.Module)
-    return model
+    return create_model("cascaded", width=8)

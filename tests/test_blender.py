@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 from commands import succeeds
+from pictures import channels_of
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
@@ -49,21 +49,13 @@ def test_buffers_are_read_as_by_the_package(shot: str, frames: Any, tmp_path: Pa
         expected = getattr(frame, name)[0].permute(1, 2, 0).numpy()
         np.testing.assert_allclose(image, expected, rtol=1e-6, atol=1e-6, err_msg=name)
     # Twice the noisy light, and everything else as it was.
-    before, after = (parts(path) for path in (source, tmp_path / "out" / "new.exr"))
+    before, after = (channels_of(path) for path in (source, tmp_path / "out" / "new.exr"))
     assert before.keys() == after.keys()
     for name, image in before.items():
         place = "RGB".find(name[-1]) if ".Combined." in name else -1
         expected = image if place < 0 else 2 * seen["color"][..., place]
         np.testing.assert_array_equal(after[name], expected, err_msg=name)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["new.exr"]
-
-
-def parts(path: Path) -> dict[str, Any]:
-    file, found = oiio.ImageInput.open(str(path)), {}
-    while file.seek_subimage(file.current_subimage() + bool(found), 0):
-        pixels = file.read_image(file.current_subimage(), 0, 0, file.spec().nchannels, "float")
-        found |= {name: pixels[..., i] for i, name in enumerate(file.spec().channelnames)}
-    return found
 
 
 @pytest.mark.parametrize("shot", SHOTS)
@@ -187,7 +179,9 @@ def test_the_zip_denoises_in_blender_as_the_command_does(frames: Any, archive: P
     same = ("--model", "wild", "--keep-all", "--map", "position=", "--layers", "all")
     succeeds("denoise", shot / "shot_####.exr", "-o", tmp_path / "out", *same)
     for number in range(1, 5):
-        found, expected = (parts(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out"))
+        found, expected = (
+            channels_of(folder / f"shot_000{number}.exr") for folder in (shot / "denoised", tmp_path / "out")
+        )
         passes = tuple(f"ViewLayer.{light}." for light in ("Combined", *frames.LIGHTS))
         lit = [name for name in found if name.startswith(passes) and name[-1] in "RGB"]
         assert len(lit) > 4

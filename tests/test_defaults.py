@@ -12,6 +12,7 @@ from refusals import refused
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError, list_models, ops
+from mcdenoise.check.case import as_tuple
 from mcdenoise.check.cases import OPS
 from mcdenoise.models import describe_weights
 
@@ -62,10 +63,6 @@ def test_compiled_kernels_denoise_alike(name: str) -> None:
     assert all(map(torch.equal, found, expected))
 
 
-def tensors(results: Any) -> list[Tensor]:
-    return [results] if isinstance(results, Tensor) else list(results)
-
-
 @pytest.mark.parametrize("op", OPS, ids=lambda op: op.name)
 def test_an_op_and_its_derivatives_are_alike(op: Any) -> None:
     def outcomes(inputs: dict[str, Any]) -> list[Tensor]:
@@ -73,7 +70,7 @@ def test_an_op_and_its_derivatives_are_alike(op: Any) -> None:
         for key, value in inputs.items():
             if isinstance(value, Tensor):
                 leaves[key] = value.detach().clone().requires_grad_(value.is_floating_point())
-        results = tensors(op.function(**leaves, **case.settings))
+        results = as_tuple(op.function(**leaves, **case.settings))
         total = sum((each * each).sum() for each in results if each.requires_grad)
         wanted = [value for value in leaves.values() if isinstance(value, Tensor) and value.requires_grad]
         gradients = torch.autograd.grad(total, wanted, allow_unused=True) if isinstance(total, Tensor) else ()
@@ -109,8 +106,9 @@ def test_training_is_alike(name: str, small_sequence: Path, tmp_path: Path) -> N
 
 
 WRONG: list[dict[str, Any]] = [
-    *({"tile": value} for value in ("64", 64.0, True, [64], -1, 65)),
+    *({"tile": value} for value in ("64", 64.0, True, [64], -1, 32, 100)),
     *({"max_memory": value} for value in ("1", True, float("nan"), -1, 0, [1])),
+    {"tile": 128, "max_memory": 4.0},
     *({"model": value} for value in (5, "", torch.zeros(3), Denoiser, [], Frame)),
     *({"device": value} for value in (None, [], "nowhere", "meta", "hpu", "cuda:99", 1.5)),
     *({"precision": value} for value in (None, 16, [], "float16")),

@@ -201,26 +201,20 @@ def test_an_output_that_is_a_link_to_an_input_is_refused(
     assert [path.name for path in out.iterdir()] == [name]
 
 
-def test_an_output_that_is_a_link_to_what_an_input_links_to_is_refused(small_sequence: Path, tmp_path: Path) -> None:
-    color, out = small_sequence / "inputs" / "color2.exr", tmp_path / "out"
-    color.rename(tmp_path / "elsewhere.exr")
-    color.symlink_to(tmp_path / "elsewhere.exr")
+@pytest.mark.parametrize(
+    ("elsewhere", "expected"),
+    [("there.exr", "a link to an input"), ("out/denoised2.exr", "denoised2.exr: expected no input")],
+)
+def test_an_output_that_is_what_an_input_links_to_is_refused(
+    small_sequence: Path, tmp_path: Path, elsewhere: str, expected: str
+) -> None:
+    """By a link of its own, or since it has the name of a result: it would be replaced."""
+    color, out, real = small_sequence / "inputs" / "color2.exr", tmp_path / "out", tmp_path / elsewhere
     out.mkdir()
-    (out / "denoised2.exr").symlink_to(tmp_path / "elsewhere.exr")
-    assert "a link to an input" in refused(
-        lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
-    )
-
-
-def test_the_folder_that_the_links_of_the_input_lead_to_is_refused(small_sequence: Path, tmp_path: Path) -> None:
-    """The files there, which have the names of the results, would be replaced."""
-    color, out = small_sequence / "inputs" / "color2.exr", tmp_path / "out"
-    out.mkdir()
-    color.rename(out / "denoised2.exr")
-    color.symlink_to(out / "denoised2.exr")
-    assert "denoised2.exr: expected no input" in refused(
-        lambda: denoise_sequence(open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
-    )
+    color.rename(real)
+    for link in {color, out / "denoised2.exr"} - {real}:
+        link.symlink_to(real)
+    assert expected in refused(denoise_sequence, open_sequence(small_sequence), out, Denoiser("noisy"), "noisy")
 
 
 def test_files_of_an_earlier_longer_run_are_kept_and_named(small_sequence: Path, tmp_path: Path) -> None:

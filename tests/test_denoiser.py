@@ -11,11 +11,11 @@ from refusals import refused
 from small import small_model
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Mean
+from toys import Mean, Same
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.data import open_sequence
-from mcdenoise.models import Accumulated, Chain, Demodulated, Needs, Output
+from mcdenoise.models import Accumulated, Chain, Demodulated, Output
 from mcdenoise.models._wrapper import parts_of
 
 
@@ -71,23 +71,6 @@ def test_missing_features_are_told() -> None:
     assert denoiser.report.missing == ["albedo", "normal"]
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), -1.0])
-def test_an_invalid_pixel_is_replaced_and_counted(frames: list[Frame], value: float) -> None:
-    broken, mended = frames[0].color.clone(), frames[0].color.clone()
-    broken[0, :, 12, 3] = value
-    window = frames[0].color[0, :, 11:14, 2:5].reshape(3, 9)[:, [0, 1, 2, 3, 5, 6, 7, 8]]
-    mended[0, :, 12, 3] = 0 if value == -1 else window.amax(1) if value == float("inf") else window.mean(1)
-    denoiser = Denoiser(small_model())
-    image = denoiser(frames[0].replace(color=broken))
-    assert denoiser.report.replaced_pixels == 1
-    assert torch.isfinite(image).all()
-    # The result is as if the pixel had been rendered like that: nothing else remembers it, now or in the next frame.
-    other = Denoiser(small_model())
-    torch.testing.assert_close(image, other(frames[0].replace(color=mended)))
-    torch.testing.assert_close(denoiser(frames[1]), other(frames[1]))
-    assert (denoiser.report.replaced_pixels, other.report.replaced_pixels) == (0, 0)
-
-
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position", "motion"])
 def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
     denoiser = Denoiser(small_model())
@@ -125,15 +108,6 @@ def test_a_network_that_hands_out_bfloat16_still_gives_float32() -> None:
                 assert {image.dtype for image in output.stages.values()} == {torch.float32}
 
 
-def test_a_recurrent_method_gets_its_state_back(frames: list[Frame]) -> None:
-    denoiser = Denoiser(Mean())
-    images = [denoiser(frame) for frame in frames]
-    for count, image in enumerate(images, start=1):
-        torch.testing.assert_close(image, torch.stack([frame.color for frame in frames[:count]]).mean(0))
-    denoiser.reset()
-    assert torch.equal(denoiser(frames[2]), frames[2].color)
-
-
 @pytest.mark.parametrize("name", ["svgf", "mrkp"])
 def test_light_with_and_without_its_albedo_have_no_common_history(frames: list[Frame], name: str) -> None:
     denoiser = Denoiser(name)
@@ -145,9 +119,7 @@ def test_light_with_and_without_its_albedo_have_no_common_history(frames: list[F
 def test_images_and_states_share_no_memory() -> None:
     """A method's state may hold the frame and the image themselves."""
 
-    class Last(nn.Module):
-        needs = Needs(trainable=False)
-
+    class Last(Same):
         def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
             image = frame.color if state is None else state[0]
             return Output(image, {"frame": frame.color}), (frame.color, image, frame.color[:, :1])
@@ -233,9 +205,7 @@ def test_a_result_that_is_none_is_refused_in_one_line_and_not_kept(name: str) ->
 def test_a_state_keeps_its_structure(first: Any, second: Any, same: bool) -> None:
     """Numbers of axes stand for tensors; what is not there may come and go."""
 
-    class Changing(nn.Module):
-        needs = Needs(trainable=False)
-
+    class Changing(Same):
         def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
             shape = second if self.second else first
             return Output(frame.color), pytree.tree_map(lambda n: None if n is None else torch.rand([1] * n), shape)
@@ -276,16 +246,6 @@ def test_derivatives_go_through_the_state_and_leave_the_images_as_they_are(frame
     assert torch.isfinite(gradient).all()
     assert gradient.abs().sum() > 0
     assert all(parameter.grad is None for parameter in model.parameters())
-
-
-def test_the_derivative_through_time_of_a_method_written_out() -> None:
-    """The derivative of the mean of three frames is a third for each of them."""
-    denoiser = Denoiser(Mean(), differentiable=True)
-    colors = [torch.rand(1, 3, 9, 7, requires_grad=True) for _ in range(3)]
-    for color in colors:
-        image = denoiser(Frame(color=color))
-    for gradient in torch.autograd.grad(image.sum(), colors):
-        torch.testing.assert_close(gradient, torch.full_like(gradient, 1 / 3))
 
 
 def test_a_model_of_ones_own_is_timed_under_its_name_in_any_wrapper(frames: list[Frame]) -> None:

@@ -103,7 +103,6 @@ def check(denoiser: Denoiser, frames: list[dict[str, Tensor]], names: tuple[str,
 @pytest.mark.parametrize("size", [(24, 40), (96, 96)], ids=str)
 def test_derivative_of_the_third_frame_in_the_first(size: tuple[int, int]) -> None:
     model = create_model("wild_small", pretrained=True)
-    assert isinstance(model, nn.Module)
     denoiser = Denoiser(model.double(), differentiable=True)
     sizes = check(denoiser, shot(size), ("color", "albedo", "normal"))
     # A demodulated history has divided by the albedo of the first frame. Of the normals it knows only decisions, and
@@ -115,7 +114,6 @@ def test_derivative_of_the_third_frame_in_the_first(size: tuple[int, int]) -> No
 
 def test_derivative_in_the_normals_of_the_same_frame() -> None:
     model = create_model("wild_small", pretrained=True)
-    assert isinstance(model, nn.Module)
     sizes = check(Denoiser(model.double(), differentiable=True), shot((24, 40), 1)[:1], ("color", "albedo", "normal"))
     assert all(size > 0 for size in sizes.values())
 

@@ -16,13 +16,13 @@ from commands import refuses, succeeds
 from refusals import refused
 from test_docs import blocks
 from torch import Tensor, nn
+from toys import Mean, Same, frame_of
 
 from mcdenoise import Frame, create_model
 from mcdenoise.export import Exported, Step, default_buffers, export_model, traced
-from mcdenoise.models import Demodulated, Model, Needs, Output, Restored, State
+from mcdenoise.models import Demodulated, Model, Needs, Output, State
 from mcdenoise.models import Recurrent as Recurrence
 from mcdenoise.models._weights import pretrained_models
-from mcdenoise.models.filtered import Filtered
 from mcdenoise.models.wild import WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 
@@ -53,20 +53,11 @@ def network():
 
 
 def frames(size: tuple[int, int], count: int = 3, batch: int = 1) -> list[dict[str, Tensor]]:
-    """A shot whose image moves by a part of a pixel."""
-    generator = torch.Generator().manual_seed(size[0])
-    found = []
-    for _ in range(count):
-        values = {
-            "color": torch.rand(batch, 3, *size, generator=generator) * 2,
-            "albedo": torch.rand(batch, 3, *size, generator=generator),
-            "normal": torch.nn.functional.normalize(torch.ones(batch, 3, *size), dim=1),
-            "depth": torch.full((batch, 1, *size), 3.0),
-            "motion": torch.full((batch, 2, *size), 0.6),
-        }
-        values["depth"][..., : size[0] // 4, :] = torch.inf
-        found.append(values)
-    return found
+    """A shot of a wall that moves by a part of a pixel; its normals and depths have no noise, unlike its light."""
+    depth, motion = torch.full((batch, 1, *size), 3.0), torch.full((batch, 2, *size), 0.6)
+    depth[..., : size[0] // 4, :] = torch.inf
+    still = {"normal": torch.nn.functional.normalize(torch.ones(batch, 3, *size), dim=1), "depth": depth}
+    return [dict(frame_of(*size, batch, seed, motion=motion, **still).items()) for seed in range(count)]
 
 
 class Moments(NamedTuple):
@@ -74,10 +65,8 @@ class Moments(NamedTuple):
     half: Tensor
 
 
-class Recurrent(nn.Module):
+class Recurrent(Same):
     """Means over time, at full and half the resolution; zeros are no history."""
-
-    needs = Needs()
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         half = torch.nn.functional.avg_pool2d(frame.color, 2, ceil_mode=True, count_include_pad=False)
@@ -174,18 +163,6 @@ def test_models_of_the_zoo_are_exported(name: str, tmp_path: Path) -> None:
         assert (image - expected).abs().mean() < 0.005 * expected.mean()
 
 
-class Mean(nn.Module):
-    """The mean with the image before; zeros are no history."""
-
-    needs = Needs()
-
-    def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
-        state = state or {"color": torch.zeros_like(frame.color), "length": torch.zeros_like(frame.color[:, :1])}
-        length = state["length"] + 1
-        mean = (state["color"] * state["length"] + frame.color) / length
-        return Output(mean), {"color": mean, "length": length}
-
-
 @pytest.fixture
 def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for package in ("onnxscript", "onnxruntime"):
@@ -212,10 +189,8 @@ def test_a_graph_is_run_as_the_page_for_engines_does(graph: Path) -> None:
     }
 
 
-class InUnits(nn.Module):
+class InUnits(Same):
     """Radiance on Open Image Denoise's scale."""
-
-    needs = Needs()
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         return Output(frame.color * oidn_exposure(frame.color)), None
@@ -233,13 +208,6 @@ def test_a_graph_counts_and_clamps_as_python_does(make: Callable[[], Model], tmp
     length = torch.full_like(buffers["color"][:, :1], 4.0)
     shot = [buffers | {"current": other["color"], "recent": other["color"], "length": length}]
     assert_alike(with_onnxruntime(exported, step, shot), eager(model, shot))
-
-
-def test_a_graph_has_no_filters_of_features_that_are_looked_at_inside_a_wrapper() -> None:
-    model = Restored(Filtered(lambda color, albedo: color * albedo))  # type: ignore[arg-type]
-    step = Step(model, {"color", "albedo"})
-    assert not traced(step).state_dict
-    assert model.inner.features == "auto"  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow
@@ -334,29 +302,23 @@ class Moved(nn.Module):
         return Output(frame.color + 0.5 * frame.extra["previous"]), None
 
 
-class Impatient(nn.Module):
+class Impatient(Same):
     """Decides by the values of its input."""
-
-    needs = Needs()
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         return Output(frame.color if bool(frame.color.mean() > 1) else frame.color + 1), None
 
 
-class Proud(nn.Module):
+class Proud(Same):
     """Its first frame is not what zeros give."""
-
-    needs = Needs()
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         mean = frame.color if state is None else (frame.color + state) / 2
         return Output(mean), mean
 
 
-class Fixed(nn.Module):
+class Fixed(Same):
     """Knows images of one size."""
-
-    needs = Needs()
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         return Output(frame.color + torch.ones(61, 1) if frame.size[0] == 61 else frame.color), None

@@ -99,15 +99,6 @@ def test_an_extra_buffer_is_checked_for_its_size_and_its_values() -> None:
     assert Frame(color=plane(3), extra={"crypto": plane(5, -INF)}).validate()[1] == 0
 
 
-def test_a_function_reaches_every_buffer() -> None:
-    frame = full_frame().replace(samples=torch.rand(2, 4, 3, *SIZE), extra={"crypto": plane(5)})
-    mapped = frame.map(lambda value: 2 * value)
-    assert mapped.buffers == frame.buffers
-    for name, value in mapped.items():
-        assert torch.equal(value, 2 * dict(frame.items())[name]), name
-    assert {value.dtype for _, value in frame.to(torch.float64).items()} == {torch.float64}
-
-
 def test_a_part_of_a_frame_is_a_view_with_the_statistics_of_the_whole() -> None:
     statistics = {"exposure": torch.ones(2, 1, 1, 1)}
     skip = Skip(torch.ones(2, 1, *SIZE, dtype=torch.bool), plane(3))

@@ -17,11 +17,9 @@ from refusals import refused
 
 from mcdenoise.data.exr import read_exr, write_exr
 from mcdenoise.data.sequences import open_sequence
-from mcdenoise.models import create_model
-from mcdenoise.models._report import FrameReport
 from mcdenoise.scenes.demo import demo_cameras, demo_scene
 from mcdenoise.scenes.random.builder import place, rotate
-from mcdenoise.scenes.render import Camera, render_sequence, view_projection
+from mcdenoise.scenes.render import Camera, render_sequence
 from mcdenoise.scenes.render import frames as render_frames
 from mcdenoise.scenes.render.loading import LLVM, first_working
 
@@ -94,19 +92,6 @@ def test_a_static_camera_repeats_the_features_but_not_the_noise(sequence: Path) 
     lit = (read(sequence, "albedo1") > 0).any(axis=-1)
     first, second = (read(sequence, f"color{number}")[lit].mean(axis=-1) for number in (1, 2))
     assert (first != second).mean() > 0.8
-
-
-def test_the_same_seed_gives_the_same_files_and_another_seed_does_not(tmp_path: Path) -> None:
-    folders = [
-        render_sequence(demo_scene(), demo_cameras(2), tmp_path / name, seed=seed, reference_spp=2, **SCALAR)
-        for name, seed in (("a", 5), ("b", 5), ("c", 6))
-    ]
-    first, again, other = (images(folder) for folder in folders)
-    assert first == again
-    assert describe(folders[0]) == describe(folders[1])
-    assert {name for name in first if first[name] != other[name]} == {
-        f"{kind}{number}.exr" for kind in ("color", "reference") for number in range(2)
-    }
 
 
 def test_a_stopped_run_is_resumed(tmp_path: Path) -> None:
@@ -228,13 +213,6 @@ def test_variants_agree_on_what_moves(moving: Path, tmp_path: Path) -> None:
     for name in ("world_position2", "previous_position2", "albedo2"):
         different = np.abs(read(folder, name) - read(moving, name)).max(axis=-1) > 2e-3
         assert different.mean() < 0.01, name
-
-
-def test_view_projection_of_a_point_to_the_right_and_above() -> None:
-    camera = Camera.look_at((0, 0, 5), (0, 0, 0), fov_x=90)
-    clip = np.array((1.0, 0.5, 3.0, 1.0)) @ view_projection(camera, 200, 100, near=1, far=9)
-    u, v = (clip[:2] / clip[3] + 1) / 2
-    np.testing.assert_allclose((u, v, clip[3]), (0.75, 0.25, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -481,25 +459,6 @@ def test_moving_points_stay_on_their_surface(moving: Path) -> None:
         assert on_ball.sum() > 20
         radius = np.linalg.norm(before - center - moves[frame - 1, :3, 3], axis=-1)
         np.testing.assert_allclose(radius[on_ball], 0.8, atol=1e-4)
-
-
-def test_history_follows_what_moves(moving: Path) -> None:
-    sequence = open_sequence(moving)
-    assert "previous_position" in sequence.buffers
-    kept = {}
-    accumulated = create_model("accumulated")
-    for known in (True, False):
-        state = None
-        for number in sequence.numbers:
-            frame, _ = sequence.frame(number).validate()
-            moved = (frame.previous_position != frame.position).any(1, keepdim=True)
-            output, state = accumulated(frame if known else frame.replace(previous_position=None), state)
-        report = FrameReport()
-        report.add(output.notes)
-        assert report.reset == ""
-        kept[known] = (state[0].length[moved] > 1).float().mean().item()
-    assert kept[True] > 0.9
-    assert kept[False] < kept[True] - 0.3
 
 
 def test_several_workers_write_the_same_files(moving: Path, tmp_path: Path) -> None:

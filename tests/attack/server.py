@@ -15,7 +15,7 @@ import sys
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
@@ -45,7 +45,6 @@ class Process:
     signal: int = signal.SIGKILL
     largest_file: int | None = None
     user: int | None = None
-    environment: dict[str, str] = field(default_factory=dict)
 
 
 class Ended(NamedTuple):
@@ -150,7 +149,7 @@ def fork(task: dict, room: int) -> int:
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         os.chdir(task["folder"])
-        os.environ |= {"HOME": task["folder"], "XDG_CACHE_HOME": f"{task['folder']}/.cache", **task["environment"]}
+        os.environ |= {"HOME": task["folder"], "XDG_CACHE_HOME": f"{task['folder']}/.cache"}
         resource.setrlimit(resource.RLIMIT_AS, (room, room))
         if task["largest_file"] is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (task["largest_file"],) * 2)

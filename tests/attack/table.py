@@ -26,6 +26,7 @@ from mcdenoise.cli import load_command, main
 from mcdenoise.data.exr import read_exr
 from mcdenoise.data.readers.bmfr import read_clean_features
 from mcdenoise.errors import InputError
+from mcdenoise.models import describe_weights
 from mcdenoise.results import Results
 
 Meaning = Callable[[bytes], object]
@@ -56,9 +57,8 @@ class Command:
 def images(folder: Path, _: str) -> object:
     """Pixels of all images written, and their files in the report."""
     out = folder / "out"
-    pixels = {path.name: digest(read_exr(path)[0]) for path in sorted(out.glob("*.exr"))}
     report = json.loads((out / "denoise.json").read_text())
-    return pixels, sorted(each["file"] for each in report["frames"].values())
+    return exr_files(out), sorted(each["file"] for each in report["frames"].values())
 
 
 def filmed(folder: Path, _: str) -> object:
@@ -72,14 +72,7 @@ def printed(_: Path, out: str) -> object:
 
 
 def weights(folder: Path, _: str) -> object:
-    return tensors(folder / f"run/{MODEL}.safetensors")
-
-
-def tensors(path: Path) -> object:
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        return file.metadata()["sha256"]
+    return describe_weights(folder / f"run/{MODEL}.safetensors")["sha256"]
 
 
 def page(folder: Path, _: str) -> object:

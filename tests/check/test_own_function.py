@@ -113,10 +113,7 @@ def test_a_wrong_derivative_exits_with_1(mine: Path, tmp_path: Path) -> None:
     results = json.loads(path.read_text())
     assert [result["case"] for result in results] == ["dark", "bright"]
     # The square of 1e3 has the derivative 2e3, and the wrong one is three quarters of it.
-    assert results[1]["message"] == (
-        "Jacobian mismatch for output 0 with respect to input 0: element 0 of the output in element 0 of the input has "
-        "the difference quotient 2000 and the derivative 1500"
-    )
+    assert results[1]["message"].endswith("the difference quotient 2000 and the derivative 1500")
     assert results[0]["message"].startswith("Jacobian mismatch for output 0 with respect to input 0: element 0 of ")
 
 

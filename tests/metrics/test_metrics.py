@@ -32,41 +32,49 @@ def image(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float32).expand(1, 3, 1, len(values))
 
 
+def rgb(*values: float) -> Tensor:
+    """``(1, 3, 1, 1)``: one pixel."""
+    return torch.tensor(values, dtype=torch.float32).reshape(1, 3, 1, 1)
+
+
 def clip(*values: float) -> Tensor:
     """``(1, T, 3, 1, 1)``: T frames of one gray pixel."""
     return torch.tensor(values, dtype=torch.float32).reshape(1, -1, 1, 1, 1).expand(1, -1, 3, 1, 1)
 
 
-def test_smape_written_out() -> None:
+TWO = torch.zeros(1, 2, 3, 1, 2)
+TWO[:, 1, :, :, 0] = 0.002
+# Metric, image, reference, value, and the bound of its relative error.
+WRITTEN_OUT = [
     # |1 - 3| / (1 + 3 + 0.01), and a black pixel without an error.
-    assert smape_linear(image(1, 0), image(3, 0)).item() == pytest.approx((2 / 4.01 + 0) / 2)
+    (smape_linear, image(1, 0), image(3, 0), 2 / 4.01 / 2, 1e-6),
     # In the dark the epsilon decides: 0.01 against 0 is half an error, not a whole one.
-    assert smape_linear(image(0.01), image(0)).item() == pytest.approx(0.5)
-
-
-def test_temporal_smape_written_out() -> None:
+    (smape_linear, image(0.01), image(0), 0.5, 1e-6),
     # Differences 1, 2 against 1, 0: the first has no error, the second |2 - 0| / (2 + 0 + 0.01).
-    error = temporal_smape_linear(clip(0, 1, 3), clip(5, 6, 6))
-    assert error.item() == pytest.approx((0 + 2 / 2.01) / 2)
+    (temporal_smape_linear, clip(0, 1, 3), clip(5, 6, 6), 2 / 2.01 / 2, 1e-6),
     # Differences are absolute, so the direction does not matter.
-    assert temporal_smape_linear(clip(0, 1), clip(1, 0)).item() == 0
-
-
-def test_relmse_written_out() -> None:
-    color = torch.tensor([1.0, 2.0, 3.0]).reshape(1, 3, 1, 1)
-    reference = torch.tensor([1.0, 2.0, 6.0]).reshape(1, 3, 1, 1)
-    assert relmse_linear(color, reference).item() == pytest.approx((0 + 0 + 9) / (3**2 + 0.01) / 3)
-
-
-def test_rmse_written_out() -> None:
+    (temporal_smape_linear, clip(0, 1), clip(1, 0), 0, 0),
+    # The errors of a pixel's channels are relative to the mean of these.
+    (relmse_linear, rgb(1, 2, 3), rgb(1, 2, 6), 9 / (3**2 + 0.01) / 3, 1e-6),
     # One of two pixels has an error of 2 in every channel: sqrt((4 + 0) / 2).
-    assert rmse_linear(image(1.0, 5.0), image(3.0, 5.0)).item() == pytest.approx(math.sqrt(2))
-
-
-def test_psnr_written_out() -> None:
+    (rmse_linear, image(1, 5), image(3, 5), math.sqrt(2), 1e-6),
     # The sRGB curve multiplies values up to 0.0031308 by 12.92; an error of 0.01292 is -20 log10(0.01292) dB.
-    assert psnr_srgb(image(0.001), image(0.002)).item() == pytest.approx(-20 * math.log10(0.01292), abs=1e-3)
-    assert psnr_srgb(image(5.0), image(1.0)).item() == math.inf
+    (psnr_srgb, image(0.001), image(0.002), -20 * math.log10(0.01292), 2e-5),
+    (psnr_srgb, image(5), image(1), math.inf, 0),
+    # The errors 0, 1, 3 (in 1/1000) change by 1 and 2.
+    (temporal_rmse_srgb, clip(0, 0.001, 0.003), clip(0, 0, 0), 12.92e-3 * (1 + 2) / 2, 1e-4),
+    # A change in the wrong direction is an error, unlike in temporal_smape_linear.
+    (temporal_rmse_srgb, clip(0, 0.001), clip(0.001, 0), 12.92e-3 * 2, 1e-4),
+    # The root is taken of the mean over the frame, in which one of two pixels changes by 0.002.
+    (temporal_rmse_srgb, TWO, torch.zeros_like(TWO), 12.92 * 0.002 / math.sqrt(2), 1e-4),
+    # Changes above white are not displayed, and a constant error does not flicker.
+    (temporal_rmse_srgb, clip(2, 7), clip(1, 1), 0, 0),
+]
+
+
+@pytest.mark.parametrize(("metric", "image", "reference", "expected", "bound"), WRITTEN_OUT)
+def test_written_out(metric: Any, image: Tensor, reference: Tensor, expected: float, bound: float) -> None:
+    assert metric(image, reference).item() == pytest.approx(expected, rel=bound, abs=0)
 
 
 def noisy_pair(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -122,23 +130,6 @@ def test_hdr_flip_sees_errors_that_a_display_clamps() -> None:
     assert flip_hdr(dimmer, reference).item() > 0.05
     # Exposures depend on the reference alone, so errors beyond all of them are finite too.
     assert 0 < flip_hdr(torch.full_like(reference, 1e9), reference).item() <= 1
-
-
-def test_temporal_rmse_written_out() -> None:
-    # All values are on the linear part of the sRGB curve, which multiplies by 12.92. The errors 0, 1, 3 (in 1/1000)
-    # change by 1 and 2.
-    error = temporal_rmse_srgb(clip(0, 0.001, 0.003), clip(0, 0, 0))
-    assert error.item() == pytest.approx(12.92e-3 * (1 + 2) / 2, rel=1e-4)
-    # A change in the wrong direction is an error, unlike in temporal_smape_linear.
-    assert temporal_rmse_srgb(clip(0, 0.001), clip(0.001, 0)).item() == pytest.approx(12.92e-3 * 2, rel=1e-4)
-    # The root is taken of the mean over the frame, in which one of two pixels changes by 0.002.
-    two = torch.zeros(1, 2, 3, 1, 2)
-    two[:, 1, :, :, 0] = 0.002
-    assert temporal_rmse_srgb(two, torch.zeros_like(two)).item() == pytest.approx(
-        12.92 * 0.002 / math.sqrt(2), rel=1e-4
-    )
-    # Changes above white are not displayed, and a constant error does not flicker.
-    assert temporal_rmse_srgb(clip(2, 7), clip(1, 1)).item() == 0
 
 
 def test_temporal_metrics_batch_and_have_a_gradient() -> None:

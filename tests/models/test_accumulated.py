@@ -388,16 +388,6 @@ def test_a_still_frame_needs_no_reprojection_to_the_last_bit(size: tuple[int, in
     assert seen.length.max() == 14
 
 
-def test_the_last_frame_is_no_history() -> None:
-    history = Shot()
-    color = torch.rand(1, 3, HEIGHT, WIDTH)
-    history.update(still(color))
-    last = history.update(still(color), last=True)
-    assert last.length.unique().tolist() == [2]
-    assert history.state[0] is None
-    assert history.update(still(color)).reset == "first frame"
-
-
 CUTS = {
     "cut": {"normal": torch.tensor([0.0, 0.0, 1.0]).reshape(1, 3, 1, 1).expand(1, 3, HEIGHT, WIDTH)},
     "size change": {},
@@ -486,36 +476,12 @@ def test_brighter_light_comes_sooner() -> None:
     assert seen.color.mean() > 4
 
 
-def test_steady_light_keeps_its_history() -> None:
-    lagging, history = Shot(lag_threshold=math.inf), Shot()
-    for frame in switched(20, 20):
-        expected, seen = lagging.update(frame), history.update(frame)
-    torch.testing.assert_close(seen.color, expected.color)
-    assert torch.equal(seen.length, expected.length)
-
-
 def test_after_a_change_a_new_history_grows() -> None:
     history = Shot()
     for frame in switched(20, 30, 0.2):
         seen = history.update(frame)
     assert seen.length.min() > 9
     assert abs(seen.color.mean() - 0.2) < 0.02
-
-
-@pytest.mark.parametrize("pixels", [2 * 16, 100])
-def test_the_history_is_the_same_a_few_rows_at_a_time(pixels: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    g, frames = torch.Generator().manual_seed(1), switched(6, 9, 0.3)
-    albedo = torch.rand(1, 3, 16, 16, generator=g) * (torch.rand(1, 1, 16, 16, generator=g) > 0.2)
-    motion = torch.rand(1, 2, 16, 16, generator=g) - 0.5
-    frames = [frame.replace(albedo=albedo, motion=motion) for frame in frames]
-    whole, bands = Shot(), Shot()
-    expected = [whole.update(frame) for frame in frames]
-    assert expected[-1].length.max() < 9
-    monkeypatch.setattr("mcdenoise.ops._rows._PIXELS", pixels)
-    for frame, seen in zip(frames, expected, strict=True):
-        found = bands.update(frame)
-        assert torch.equal(found.color, seen.color)
-        assert torch.equal(found.length, seen.length)
 
 
 def test_a_first_frame_a_cut_and_another_size_begin_a_recent_history_too() -> None:

@@ -6,8 +6,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 from oracles import filters, resolutions
-from torch import Tensor, nn
-from toys import frame_of, small, whole_frame
+from torch import Tensor
+from toys import drawn, frame_of, small, whole_frame
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Chain, create_model
@@ -21,14 +21,6 @@ SIZE = (7, 9)
 def networks(model: Any) -> list[PixelNetwork | KernelNetwork]:
     chain = next(parts_of(model, Chain))
     return [part for part in chain.modules() if isinstance(part, PixelNetwork | KernelNetwork)]
-
-
-def drawn(network: nn.Module) -> Any:
-    """Return the network with weights in float64, so that every part of the equations has an effect."""
-    torch.manual_seed(3)
-    for name, parameter in network.named_parameters():
-        nn.init.normal_(parameter, std=0.3 if "fusions" in name or "heads" in name else 0.15)
-    return network.double()
 
 
 def fused(network: Any, images: list[Tensor]) -> Tensor:

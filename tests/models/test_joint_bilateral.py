@@ -2,6 +2,7 @@
 
 import torch
 from kornia.filters import joint_bilateral_blur
+from toys import frame_of
 
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
@@ -12,23 +13,9 @@ from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, remodulate
 
 
-def frame(height: int = 20, width: int = 26, seed: int = 0) -> Frame:
-    """Noise on two walls that differ in normal, albedo and depth, with background in the first row."""
-    generator = torch.Generator().manual_seed(seed)
-    color = torch.rand(1, 3, height, width, generator=generator)
-    right = (torch.arange(width) >= width // 2).expand(1, 1, height, width)
-    normal = torch.where(
-        right, torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1), torch.tensor([0, 0, 1.0]).reshape(1, 3, 1, 1)
-    )
-    depth = torch.where(right, 4.0, 2.0)
-    depth[:, :, 0] = torch.inf
-    return Frame(
-        color=color, albedo=torch.where(right, 0.8, 0.3).expand_as(color).contiguous(), normal=normal, depth=depth
-    )
-
-
 def test_is_the_filter_of_kornia() -> None:
-    given = frame(40, 60)
+    given = frame_of(40, 60)
+    given = given.replace(albedo=0.3 + given.albedo / 2)
     depth = torch.where(given.depth.isfinite(), given.depth, 1)
     typical = torch.exp(torch.log(depth).sum() / given.depth.isfinite().sum())
     nearness = torch.where(given.depth.isfinite(), depth / (depth + typical), 1)
@@ -54,7 +41,7 @@ def test_windows_stay_within_memory() -> None:
 
 
 def test_guides_itself_without_features() -> None:
-    color = frame().color
+    color = frame_of(20, 26).color
     settings = {"border_type": "replicate", "color_distance_type": "l2"}
     guide = torch.nn.functional.pad(torch.log1p(color * auto_exposure(color)), (1, 1, 1, 1), mode="replicate")
     guide = guide.unfold(2, 3, 1).unfold(3, 3, 1).flatten(4).median(4).values
@@ -63,7 +50,7 @@ def test_guides_itself_without_features() -> None:
 
 
 def test_differentiable() -> None:
-    given = frame(3, 4).to(torch.float64)
+    given = frame_of(3, 4).to(torch.float64)
     model = JointBilateral(0.5, 0.5)
 
     def image(color: torch.Tensor, albedo: torch.Tensor) -> torch.Tensor:

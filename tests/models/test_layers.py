@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from toys import Same, cascade, frame_of, one_of_each, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Needs, Output, Skipping, Tiled, list_models
+from mcdenoise.models import Accumulated, Demodulated, Exposed, Output, Skipping, Tiled, list_models
 from mcdenoise.models._layers import REST, closed, fractions, split
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models.joint_bilateral import JointBilateral
@@ -104,7 +104,6 @@ def test_what_a_filter_leaves_of_distant_light_has_derivatives(leak: float) -> N
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
 def test_layers_of_tiles_are_those_of_the_image(name: str) -> None:
     whole = Denoiser(small(name))
     if not isinstance(whole.model, nn.Module) or not any(isinstance(part, Tiled) for part in whole.model.modules()):
@@ -119,7 +118,6 @@ def test_layers_of_tiles_are_those_of_the_image(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
 def test_a_layer_that_is_all_is_the_image_and_one_that_is_black_stays_black(name: str) -> None:
     denoiser = Denoiser(small(name))
     for frame in shot(denoiser.model):
@@ -129,7 +127,6 @@ def test_a_layer_that_is_all_is_the_image_and_one_that_is_black_stays_black(name
 
 
 @pytest.mark.parametrize("name", sorted(set(MODELS) - {"guided", "cascaded", "bmfr"}))
-@torch.no_grad()
 def test_layers_are_denoised_by_a_linear_map(name: str) -> None:
     """Joined before or after, and scaled before or after.
 
@@ -146,7 +143,6 @@ def test_layers_are_denoised_by_a_linear_map(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
 def test_alpha_is_filtered_with_every_method(name: str) -> None:
     denoiser = Denoiser(small(name), alpha=True)
     kept = Denoiser(small(name))
@@ -162,7 +158,6 @@ def test_alpha_is_filtered_with_every_method(name: str) -> None:
 
 @pytest.mark.parametrize("value", [0.0, 0.7, 1.0])
 @pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
 def test_an_alpha_that_is_the_same_everywhere_stays(name: str, value: float) -> None:
     denoiser = Denoiser(small(name), alpha=True)
     for frame in shot(denoiser.model):
@@ -170,16 +165,6 @@ def test_an_alpha_that_is_the_same_everywhere_stays(name: str, value: float) -> 
         # A mean of up to 17x17 taps, each with a weight that is rounded.
         allowed = 17**2 * torch.finfo(torch.float32).eps / 2 * value
         assert (output.alpha - value).abs().max() <= allowed
-
-
-@pytest.mark.parametrize("name", MODELS)
-@torch.no_grad()
-def test_black_frames_have_black_layers(name: str) -> None:
-    denoiser = Denoiser(small(name))
-    for frame in shot(denoiser.model, 2):
-        black = torch.zeros_like(frame.color)
-        output = denoiser.output(frame.replace(color=black, layers={"a": black, "b": black}))
-        assert_sum(output.image, output.layers)
 
 
 def test_stages_are_asked_for_by_themselves() -> None:
@@ -282,7 +267,6 @@ def test_histories_of_layers_have_the_weights_of_the_color_s() -> None:
     assert (output.layers["glossy"][..., 10, 12] < 0.1 * expected[..., 10, 12]).all()
 
 
-@torch.no_grad()
 def test_a_light_that_goes_out_goes_out_of_its_layer() -> None:
     """The test for lag discards a layer's history where it discards that of the color."""
     denoiser = Denoiser("accumulated")
@@ -296,7 +280,6 @@ def test_a_light_that_goes_out_goes_out_of_its_layer() -> None:
     assert_sum(output.image, output.layers)
 
 
-@torch.no_grad()
 def test_a_method_without_kernels_is_split_by_filtered_proportions() -> None:
     """Noisy layers of a constant proportion on either side of an edge of the features."""
     height, width = 24, 40
@@ -318,9 +301,7 @@ def test_a_method_without_kernels_is_split_by_filtered_proportions() -> None:
     assert denoiser.report.stages["layers"].reason.endswith("the method has no kernels")
 
 
-class Layered(nn.Module):
-    needs = Needs(trainable=False)
-
+class Layered(Same):
     def __init__(self, **layers: Any) -> None:
         super().__init__()
         self.layers = layers
@@ -344,7 +325,6 @@ def test_layers_of_a_method_of_your_own() -> None:
     )
 
 
-@torch.no_grad()
 def test_where_all_parts_are_black_they_have_their_proportion_of_the_whole() -> None:
     image = torch.rand(1, 3, 4, 5)
     parts = {"a": torch.ones(1, 3, 4, 5), "b": torch.full((1, 3, 4, 5), 3.0)}
@@ -370,7 +350,6 @@ def test_layers_pass_through_every_wrapper() -> None:
     torch.testing.assert_close(sum(output.layers.values(), torch.zeros(())), output.image, rtol=1e-5, atol=1e-6)
 
 
-@torch.no_grad()
 def test_where_layers_are_asked_for_no_tile_is_passed_through_or_used_again() -> None:
     denoiser = Denoiser(cascade())
     color = torch.full((1, 3, 40, 304), 0.5)

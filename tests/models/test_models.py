@@ -185,7 +185,8 @@ def test_the_declared_needs_suffice(name: str) -> None:
 
 
 @pytest.mark.parametrize("bare", [False, True], ids=["", "bare"])
-@pytest.mark.parametrize("factor", [2.0**-20, 1e5])
+# The squares of the first are near the smallest numbers of float32.
+@pytest.mark.parametrize("factor", [2.0**-60, 1e5])
 @pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_exposure_only_scales_the_result(name: str, factor: float, bare: bool) -> None:
@@ -614,7 +615,6 @@ def test_weights_in_bfloat16_load(weights: Path) -> None:
 
     expected = {key: value.bfloat16().float() for key, value in load_file(weights).items()}
     loaded = load_weights(altered(weights, converted))
-    assert isinstance(loaded, nn.Module)
     parameters = [parameter for _, parameter in sorted(loaded.named_parameters())]
     assert {parameter.dtype for parameter in parameters} == {torch.float32}
     assert torch.equal(parameters[0], expected["final.fusions.0.conv.bias"])

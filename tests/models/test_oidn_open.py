@@ -17,7 +17,7 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
-from mcdenoise.models.oidn_open import OidnOpen, OpenFilters
+from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
 from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
 
@@ -197,19 +197,6 @@ def test_derivatives_of_the_scale(function: Any) -> None:
     edge = torch.tensor([0.0, 1.0], requires_grad=True)
     function(edge).sum().backward()
     assert edge.grad.isfinite().all()
-
-
-def test_gradients_of_the_network_in_float64() -> None:
-    torch.manual_seed(0)
-    model = OidnOpen("small").double()
-    # An exposure of its own, which has a gradient in nothing.
-    frame = lit(16, 16).to(torch.float64).replace(statistics={"oidn_exposure": torch.ones(1, 1, 1, 1).double()})
-    frame = frame.replace(color=0.1 + 0.8 * frame.albedo)
-
-    def image(color: Tensor) -> Tensor:
-        return model(frame.replace(color=color))[0].image
-
-    assert torch.autograd.gradcheck(image, (frame.color.clone().requires_grad_(),), fast_mode=True, atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (17, 40), (100, 77), (5, 3)])

@@ -173,22 +173,6 @@ def relative(a: Tensor, b: Tensor) -> float:
     return float((a - b).square().mean().sqrt() / b.mean())
 
 
-def test_a_tile_without_noise_is_passed_through() -> None:
-    short, whole = pair(cascade(), tolerance=1e-3)
-    for number in range(12):
-        # Noise in the left part only.
-        quiet, loud = wall(number, 0.003), wall(number, 1.0)
-        right = torch.arange(WIDTH) >= 96
-        frame = quiet.replace(color=torch.where(right, quiet.color, loud.color))
-        output, expected = short.output(frame), whole.output(frame)
-    tiles = stage(short, "converged tiles")
-    assert (tiles.skipped, tiles.exact) == (pytest.approx(128 / WIDTH), False)
-    assert torch.equal(output.image[..., 96:], output.stages["accumulated"][..., 96:])
-    assert not torch.equal(output.image[..., :96], output.stages["accumulated"][..., :96])
-    # The pixels that are passed through are a better image for the second network, at its border too.
-    assert relative(output.image[..., :64], expected.image[..., :64]) < 0.02
-
-
 def test_noise_is_estimated_as_it_is() -> None:
     alpha_min = 0.05
     for count in (12, 60):
@@ -346,15 +330,6 @@ def test_reused_and_passed_tiles_of_a_toy_are_not_computed() -> None:
     assert report.stages["network"].skipped == 1
     assert toy.pixels == 15 * HEIGHT * WIDTH
     assert torch.equal(outputs[-1].image, outputs[14].image)
-
-
-def test_nothing_is_skipped_but_copied_where_all_is_to_be_kept() -> None:
-    toy = Blur()
-    frames = [sky(wall(0), 96).replace(albedo=None)] * 20
-    outputs, report = shot_of(Accumulated(Skipping(Tiled(toy))), frames, keep_all=True)
-    assert {name for name, one in report.stages.items() if one.skipped} == {"noise-free pixels"}
-    assert toy.pixels == 20 * HEIGHT * WIDTH
-    assert torch.equal(outputs[-1].image[..., :96, :], frames[0].color[..., :96, :])
 
 
 def test_a_recurrent_method_keeps_its_state_beside_skipped_pixels() -> None:

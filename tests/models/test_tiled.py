@@ -9,7 +9,7 @@ import torch
 from planes import synthetic
 from refusals import refused
 from torch import Tensor
-from toys import Blur, Brightest, Mean, Same, cascade, frame_of, small
+from toys import Blur, Mean, Same, cascade, frame_of, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import Skip
@@ -101,17 +101,6 @@ def test_a_toy_is_tiled_without_knowing_it(side: int, size: tuple[int, int]) -> 
     assert toy.pixels == inner[0] * inner[1]
 
 
-def test_a_toy_whose_pixels_depend_on_statistics_is_given_those_of_the_whole_image() -> None:
-    frame = frame_of(96, 160)
-    expected, _ = Brightest()(frame)
-    assert torch.equal(Tiled(Brightest(), 32)(frame)[0].image, expected.image)
-    # Those that it finds of a tile are others.
-    apart = torch.cat(
-        [Brightest()(frame.crop(slice(0, 96), columns))[0].image for columns in (slice(0, 80), slice(80, 160))], 3
-    )
-    assert not torch.equal(apart, expected.image)
-
-
 def test_a_method_that_needs_the_whole_image_is_not_tiled() -> None:
     frame, seen = frame_of(96, 160), []
 
@@ -178,27 +167,6 @@ def test_known_pixels_are_not_computed() -> None:
     output, _ = Tiled(toy)(frame.replace(skip=Skip(torch.ones_like(mask), known)))
     assert toy.pixels == 0
     assert torch.equal(output.image, known)
-
-
-@pytest.mark.parametrize(("top", "left"), [(0, 0), (100, 131), (170, 250)])
-@torch.no_grad()
-def test_a_part_of_an_image_is_that_of_the_whole(top: int, left: int) -> None:
-    frame = frame_of(237, 331, length=torch.ones(1, 1, 237, 331))
-    mask = torch.ones(1, 1, 237, 331, dtype=torch.bool)
-    mask[..., top : top + 60, left : left + 70] = False
-    for tiled in parts_of(small("cascaded").to(memory_format=torch.channels_last), Tiled):
-        given = prepared(tiled, frame)
-        whole = tiled(given)[0].image
-        part = tiled(given.replace(skip=Skip(mask, frame.color)))[0].image
-        # Convolutions choose the order of their sums by the size of the image and the number of threads.
-        scale, needed = float(whole.abs().mean()), ~mask[0, 0]
-        assert (whole - part)[..., needed].abs().max() < 1e-5 * scale
-        assert (part == frame.color).all(1).float().mean() > 0.5
-        # Less than what a network sees is not enough.
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(Tiled, "halo", 24)
-            part = tiled(given.replace(skip=Skip(mask, frame.color)))[0].image
-        assert (whole - part)[..., needed].abs().max() > 1e-4 * scale
 
 
 @torch.no_grad()
@@ -300,20 +268,6 @@ def test_too_little_memory_is_told_with_the_least_that_works() -> None:
     assert not division(500, cap).has_room_ahead(frames)
     assert division(500, 2 * cap).has_room_ahead(frames)
     assert "expected at least" in refused(lambda: division(500, cap - 0.1).chosen(frames))
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        ({"tile": 32}, "tile: expected a multiple of 32 of at least 64 pixels, found 32"),
-        ({"tile": 100}, "tile: expected a multiple of 32 of at least 64 pixels, found 100"),
-        ({"max_memory": 0.0}, "max_memory: expected a number of GB above 0, found 0"),
-        ({"max_memory": float("nan")}, "max_memory: expected a number of GB above 0, found nan"),
-        ({"tile": 128, "max_memory": 4.0}, "tile, max_memory: expected one of them, found both"),
-    ],
-)
-def test_bad_settings(settings: dict[str, Any], expected: str) -> None:
-    assert expected in refused(lambda: Denoiser(cascade(), **settings))
 
 
 def test_a_module_that_computes_no_tiles_has_none() -> None:

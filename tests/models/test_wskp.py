@@ -39,7 +39,6 @@ def test_the_merged_kernel_equals_the_branches(identity: bool) -> None:
 def test_parameters_and_products_of_the_deployed_network(layers: int, expected: int) -> None:
     """No biases: as many products a pixel as parameters."""
     network = next(parts_of(create_model("wskp", layers=layers), Tiled)).inner
-    assert isinstance(network, WskpNetwork)
     assert sum(layer.merged().numel() for layer in network.layers) == expected
     assert [layer.identity for layer in network.layers] == [False, *[True] * (layers - 2), False]
 

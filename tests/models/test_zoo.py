@@ -86,7 +86,6 @@ def test_extremes_stay_finite(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["anf", "layered", "nppd", "sbmc"])
-@torch.no_grad()
 def test_a_broken_sample_breaks_nothing(name: str) -> None:
     denoiser = Denoiser(small(name))
     frame = whole_frame(denoiser.model, 9, 8)

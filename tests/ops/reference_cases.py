@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mcdenoise.check.case import as_tuple
 from mcdenoise.check.cases import OPS, Case, Inputs, Op
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
@@ -34,8 +35,7 @@ def by(backend: Backend, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def outcomes(op: Op, case: Case, inputs: Inputs, backend: Backend) -> list[Tensor]:
-    results = by(backend, op.function)(**inputs, **case.settings)
-    return [results] if isinstance(results, Tensor) else list(results)
+    return list(as_tuple(by(backend, op.function)(**inputs, **case.settings)))
 
 
 def assert_same(actual: Sequence[Tensor], exact: Sequence[Tensor], tolerance: float) -> None:
@@ -48,7 +48,7 @@ def assert_same(actual: Sequence[Tensor], exact: Sequence[Tensor], tolerance: fl
 
 
 def channels_last(tensor: Tensor) -> Tensor:
-    return tensor.contiguous(memory_format=torch.channels_last)
+    return tensor.movedim(1, -1).contiguous().movedim(-1, 1)
 
 
 def slice_of_pixels(tensor: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from oracles import oracle
-from reference_cases import every_other_column, transposed
+from reference_cases import channels_last, every_other_column, transposed
 from torch import Tensor
 
 from mcdenoise import ops
@@ -71,10 +71,6 @@ def test_gradcheck(op: Op) -> None:
     results = [gradients.check_case(*each) for each in gradients.select([op.name])]
     assert [result.case for result in results] == [case.name for case in op.cases if case.differentiable]
     assert not [f"{result.case}: {result.message}" for result in results if not result.passed]
-
-
-def channels_last(tensor: Tensor) -> Tensor:
-    return tensor.movedim(1, -1).contiguous().movedim(-1, 1)
 
 
 def expanded(tensor: Tensor) -> Tensor:

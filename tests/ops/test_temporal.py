@@ -4,7 +4,7 @@ import torch
 from reference_cases import by, draw
 from torch import Tensor
 
-from mcdenoise.ops import Surface, accumulate, motion_from_position, reproject, use
+from mcdenoise.ops import Surface, motion_from_position, reproject, use
 from mcdenoise.ops._backend import BACKENDS
 
 INF, NAN = torch.inf, torch.nan
@@ -22,20 +22,6 @@ def vectors(rows: list[list[tuple[float, ...]]]) -> Tensor:
 
 def still(height: int, width: int, batch: int = 1) -> Tensor:
     return torch.zeros(batch, 2, height, width, dtype=torch.float64)
-
-
-def test_a_still_camera_averages() -> None:
-    frames = draw(12, 3, 5, 7)
-    history, length = frames[:1], torch.ones(1, 1, 5, 7, dtype=torch.float64)
-    expected = history
-    for n in range(2, 13):
-        frame = frames[n - 1 : n]
-        history, length = accumulate(frame, history, length, still(5, 7), alpha_min=1e-3)
-        expected = torch.lerp(expected, frame, 1 / torch.full((1, 1, 5, 7), n, dtype=torch.float64))
-        # They are equal to the last bit: nothing is lost by reprojecting onto the same pixel.
-        assert torch.equal(history, expected)
-        assert torch.equal(length, torch.full_like(length, n))
-    torch.testing.assert_close(history, frames.mean(0, keepdim=True), rtol=1e-12, atol=0)
 
 
 def test_without_a_surface_it_is_kornias_remap_inside_the_image() -> None:
@@ -99,17 +85,6 @@ class TestEachTap:
             there = Surface(depth=self.other(depth=depth).depth)
             _, weight = reproject(self.previous, self.motion, Surface(depth=self.plane.depth), there)
             assert weight[0, 0, 0, 0].item() == kept
-
-
-def test_points_behind_the_camera_have_no_motion_and_no_history() -> None:
-    position = vectors([[(0.0, 0.0, 4.0), (0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (INF, 0.0, 4.0), (NAN, 0.0, 4.0)]])
-    # Row vectors: clip x and y are those of the point, and w is z.
-    matrix = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0], dtype=torch.float64))
-    matrix[2, 3] = 1
-    motion = motion_from_position(position, matrix[None])
-    assert motion.isfinite().flatten(2).tolist() == [[[True, False, False, False, False]] * 2]
-    _, weight = reproject(draw(1, 1, 1, 5), motion)
-    assert weight.flatten().tolist()[1:] == [0.0] * 4
 
 
 def test_no_motion_is_one_of_zeros_to_the_last_bit() -> None:

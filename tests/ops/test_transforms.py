@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from mcdenoise import ops
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
 
@@ -108,15 +107,3 @@ def test_the_gradient_of_a_vmap_and_jacobians(op: Op) -> None:
             jacobian(function, argnums=number)(*leaves) for jacobian in (torch.func.jacfwd, torch.func.jacrev)
         )
         torch.testing.assert_close(forward, reverse, rtol=1e-9, atol=1e-11)
-
-
-def test_default_arguments_at_a_size_where_fast_backends_are_chosen() -> None:
-    """The derivatives were silently zero here once."""
-    x = torch.rand(1, 3, 96, 128, dtype=torch.float64)
-    kernel = torch.rand(1, 9, 96, 128, dtype=torch.float64)
-    one = torch.ones_like(x)
-    tangent = torch.func.jvp(lambda x: ops.kernel_conv(x, kernel), (x,), (one,))[1]
-    torch.testing.assert_close(tangent, kernel.sum(1, keepdim=True).expand_as(x))
-    torch.testing.assert_close(torch.func.jvp(ops.downsample, (x,), (one,))[1], one[..., ::2, ::2])
-    gradient = torch.func.grad(lambda x: torch.func.vmap(ops.downsample)(x[None])[0].sum())(x)
-    torch.testing.assert_close(gradient, one / 4)

@@ -8,6 +8,7 @@ import torch
 from reference_cases import LAYOUTS, by
 from torch import Tensor
 
+from mcdenoise.check.case import as_tuple
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import transfer, wild
 
@@ -56,8 +57,7 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
 
 def results(call: Call, backend: str) -> list[Tensor]:
     function, arguments = call
-    found = by(backend, function)(*arguments)
-    return [found] if isinstance(found, Tensor) else list(found)
+    return list(as_tuple(by(backend, function)(*arguments)))
 
 
 def assert_same(actual: list[Tensor], expected: list[Tensor], tolerance: float) -> None:

@@ -25,16 +25,6 @@ def test_mean_over_scenes(folder: Path):
     assert mean.rows[1].throughput == pytest.approx(96 * 64 / 0.010 / 1e6)
 
 
-def test_a_method_that_failed_once_has_no_mean_but_a_reason(folder: Path):
-    mean, first, second = views(Results.read(folder))
-    assert mean.rows[3].reason == "second: failed: RuntimeError: out of <memory>"
-    assert not mean.rows[3].errors
-    assert first.rows[3].errors
-    assert not first.rows[3].reason
-    assert second.rows[3].reason == "failed: RuntimeError: out of <memory>"
-    assert {view.rows[4].reason for view in (mean, first, second)} == {"missing: the package <absent> is not installed"}
-
-
 def test_a_page_has_the_best_setting_of_each_model_and_the_front(folder: Path):
     results = Results.read(folder)
     assert shortlist(results, len(results.methods)) is results

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from refusals import full_disk
+from toys import Watching
 
 from mcdenoise.data import Sequence, open_sequence
 from mcdenoise.data.exr import read_exr, write_exr
@@ -18,7 +19,7 @@ from mcdenoise.data.readers.bmfr import write_buffers
 from mcdenoise.data.shards import Shard, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models import Accumulated, Demodulated, Output, create_model
+from mcdenoise.models import Accumulated, Demodulated
 from mcdenoise.ops import motion_from_position
 from mcdenoise.train.clips import ClipSampler
 from mcdenoise.train.config import TrainConfig
@@ -90,29 +91,16 @@ def test_shots_start_anew_and_are_accumulated(noisy: Path, tmp_path: Path) -> No
     for first, shot in zip((0, 2), shots, strict=True):
         for noise_seed in range(3):
             clip = shot.read(noise_seed=noise_seed)
-            seen: list[Frame] = []
-            model, history = Demodulated(Accumulated(Recorder(seen))), None
+            watching, history = Watching(), None
+            model = Demodulated(Accumulated(watching))
             for i, number in enumerate(sequence.numbers[first:]):
                 frame = sequence.frame(number, noise_seed=noise_seed).validate()[0]
                 _, history = model(frame, history)
                 for name in ("color", "current", "length"):
-                    assert torch.equal(clip[name][i], seen[i].buffer(name)[0]), name
+                    assert torch.equal(clip[name][i], watching.frames[i].buffer(name)[0]), name
                 for name in (*FEATURES, "reference"):
                     assert torch.equal(clip[name][i], frame.buffer(name)[0]), name
             assert (clip["length"][-1] > 1).any()
-
-
-class Recorder:
-    """A method that does nothing to a frame and keeps it."""
-
-    needs = create_model("wild_small").needs
-
-    def __init__(self, seen: list[Frame]) -> None:
-        self.seen = seen
-
-    def __call__(self, frame: Frame, state: None = None) -> tuple[Output, None]:
-        self.seen.append(frame)
-        return Output(frame.color), None
 
 
 def test_motion_of_positions_and_cameras(noisy: Path, tmp_path: Path) -> None:

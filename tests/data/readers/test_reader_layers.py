@@ -220,15 +220,6 @@ def test_each_eye_is_an_image_of_its_own(folder: str, rendered: Path, tmp_path: 
     assert not images["left"].equal(images["right"])
 
 
-def test_the_noisy_image_is_read_and_the_clean_one_replaced(rendered: Path) -> None:
-    sequence = open_sequence(rendered / "blender_denoised")
-    (row,) = [row for row in sequence.table if row.buffer == "color"]
-    assert row.source.endswith("ViewLayer.Noisy Image.RGBA")
-    assert row.reading.startswith("not denoised yet; 'ViewLayer.Combined.RGBA' has been, and gets the result")
-    asked = open_sequence(rendered / "blender_denoised", mapping=["color=Combined"])
-    assert not asked.frame(1).color.equal(sequence.frame(1).color)
-
-
 def test_a_layer_that_is_asked_for_is_no_copy_of_itself(rendered: Path) -> None:
     sequence = open_sequence(rendered / "blender", mapping=["color=DiffDir"])
     (row,) = [row for row in sequence.table if row.buffer == "color"]

@@ -1,20 +1,17 @@
 """Diffuse and specular light from files: used where it adds up to the color, refused in words where it does not."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from commands import run
 from pictures import as_channels, save
 from refusals import refused
 
 from mcdenoise.data import open_sequence
 from mcdenoise.data.images import read_channels, read_image_header
 from mcdenoise.frame import Frame
-from mcdenoise.models import create_model, save_weights
 
 SIZE = (12, 16)
 Image = np.ndarray[Any, Any]
@@ -127,19 +124,6 @@ def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path) -
     assert sequence.frame(1).diffuse is not None
     with pytest.warns(UserWarning, match="frame 2: diffuse, specular do not add up"):
         assert sequence.frame(2).diffuse is None
-
-
-@pytest.mark.parametrize("split", [True, False])
-def test_kpcn_filters_both_parts_of_a_real_file(rendered: Path, tmp_path: Path, split: bool) -> None:
-    settings = {"width": 4, "layers": 2, "kernel_size": 3, "split": split}
-    torch.manual_seed(0)
-    weights = tmp_path / "kpcn.safetensors"
-    weights.write_bytes(save_weights(create_model("kpcn", **settings), "kpcn", settings, {}))
-    shot = shutil.copytree(rendered / "blender", tmp_path / "shot")
-    status, printed, _ = run("denoise", shot, "-o", tmp_path / "out", "--weights", weights, "--frames", "1-2")
-    assert status == 0
-    said = "kept (diffuse and specular light)" if split else "skipped (these weights are for color alone)"
-    assert f"  specular branch: {said}\n" in printed
 
 
 def shares(count: int, seed: int = 0) -> list[Any]:

@@ -13,7 +13,6 @@ from mcdenoise.data import open_sequence
 Image = np.ndarray[Any, Any]
 
 # What these are read from is in the page docs/from-your-renderer.md and in tests/golden, which are tested.
-RENDERED = ("blender", "blender5", "blender_filtered", "blender_denoised", "blender_blur", "mitsuba", "luxcore")
 NAMED = ("pbrt", "pbrt_2021", "arnold", "renderman", "renderman_rgba", "vray", "redshift", "octane", "falcor")
 CAMERA_SPACE = {"pbrt", "pbrt_2021", "renderman", "renderman_rgba", "vray"}
 # These renderers store motion in another way than in pixels, previous - current, y down.
@@ -37,21 +36,6 @@ def projected(position: Image, matrix: Any) -> Image:
 def center(position: Image) -> Image:
     rows, columns = np.indices(position.shape[:2]) + 0.5
     return np.stack([columns, rows], -1)
-
-
-@pytest.mark.parametrize("renderer", RENDERED)
-def test_files_of_real_renderers_are_read_without_a_flag(renderer: str, rendered: Path) -> None:
-    folder = rendered / renderer
-    # Mitsuba's array without names of channels lies beside its frames.
-    sequence = open_sequence(folder / "frame.####.exr" if renderer == "mitsuba" else folder)
-    assert list(sequence.warnings) == []
-    assert sequence.color_has_albedo
-    for number in sequence.numbers:
-        frame = sequence.frame(number)
-        frame.validate()
-        assert {name for name, _ in frame.items()} == sequence.buffers
-        if "depth" in sequence.buffers:
-            assert 0.1 < frame.depth.isinf().float().mean() < 0.3
 
 
 @pytest.mark.parametrize("renderer", NAMED)
