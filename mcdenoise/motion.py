@@ -80,6 +80,13 @@ def _is_known(motion: Image) -> Mask:
     return known
 
 
+def _is_around_half(motion: Image) -> bool:
+    """Whether both channels lie in [0, 1] and around 0.5, as renderers write motion to pictures."""
+    known = motion[..., :2][_is_known(motion)]
+    inside = bool(known.size) and known.min() >= 0 and known.max() <= 1
+    return inside and bool((np.abs(np.median(known, 0) - 0.5) < 0.25).all())
+
+
 USUAL_MOTION = Convention(1, 1, "previous - current, y down, pixels")
 _AT_REST = Convention(0, 0, "no motion")
 
@@ -122,6 +129,11 @@ def read_motion(
     warnings = []
     if chosen[:2] != given[:2]:
         warnings = [f"'motion': read as {chosen.words}, since only so frames match the ones before them"]
+    elif not by_cameras and pairs and all(_is_around_half(motion) for *_, motion in pairs):
+        warnings = [
+            f"'motion': read as {chosen.words}, though all of it lies around 0.5 and between 0 and 1, as "
+            "where 0.5 stands for no motion; write raw vectors, or leave it out with --map motion="
+        ]
     return chosen, f"{chosen.words}{', as neighbouring frames match' if conclusive else ''}", warnings
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import torch
 
+from mcdenoise.ops._backend import is_transformed
+
 
 def at_hand(device: torch.device) -> bool:
-    """Whether the host may read values on a device while a step runs; a graph being recorded has none."""
-    return device.type == "cpu" and not torch.compiler.is_compiling()
+    """Whether the host may read values on a device while a step runs; a graph being recorded, or ``vmap``, has none."""
+    return device.type == "cpu" and not torch.compiler.is_compiling() and not is_transformed()

@@ -125,12 +125,15 @@ def with_void(output: Output, frame: Frame, void: Void) -> Output:
             mask = None if mask is None else mask & ((after <= 0) | (alpha > 0))
     if mask is None:
         return output
-    given = torch.where(torch.isfinite(frame.color), frame.color, 0).clamp_min(0)
+
+    def given(image: Tensor) -> Tensor:
+        return torch.where(torch.isfinite(image), image, 0).clamp_min(0).to(output.image.dtype)
+
     layers = {
-        name: torch.where(mask, frame.layers[name].to(layer.dtype) if name in frame.layers else 0, layer)
+        name: torch.where(mask, given(frame.layers[name]) if name in frame.layers else 0, layer)
         for name, layer in output.layers.items()
     }
-    return output._replace(image=torch.where(mask, given.to(output.image.dtype), output.image), layers=layers)
+    return output._replace(image=torch.where(mask, given(frame.color), output.image), layers=layers)
 
 
 def _alpha(alpha: Tensor, filtered: Tensor) -> Tensor:

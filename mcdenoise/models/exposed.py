@@ -44,16 +44,20 @@ class Exposed(Wrapper):
         # Black has no unit: what the method sees in it is black in any.
         lit = frame.color.amax((1, 2, 3), keepdim=True) > 0
         exposure = torch.where(lit, auto_exposure(frame.color), torch.finfo(frame.color.dtype).max ** 0.5)
-        exposed = scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": exposure})
-        return {**super().statistics(exposed), "exposure": exposure}
+        return {**super().statistics(_exposed(frame, exposure)), "exposure": exposure}
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
         if "exposure" not in frame.statistics:
             frame = prepared(self, frame)
         exposure = frame.statistics["exposure"]
-        output, state = self.inner(scaled(frame, exposure), state)
+        output, state = self.inner(_exposed(frame, exposure), state)
         return output.lit(lambda image: image / exposure, stages=frame.hints.stages), state
+
+
+def _exposed(frame: Frame, exposure: Tensor) -> Frame:
+    """The frame in its own unit of light, in which its exposure is 1."""
+    return scaled(frame, exposure).replace(statistics={**frame.statistics, "exposure": torch.ones_like(exposure)})
 
 
 def scaled(frame: Frame, factor: Tensor) -> Frame:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from mcdenoise.nn._cpu import ConvBlock, UpConvBlock, convolved_in_float32
 from mcdenoise.nn.unet import Live
+from mcdenoise.ops._backend import is_transformed
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import computing_dtype, corner, parts_of, up_to_multiple
 
@@ -111,7 +112,9 @@ class OidnUNet(nn.Module):
         """
         height, width = x.shape[-2:]
         x = up_to_multiple(x, _MULTIPLE)
-        x = x.to(computing_dtype(x), memory_format=torch.channels_last)
+        # Inside of vmap there is one axis more than this layout has.
+        layout = torch.preserve_format if is_transformed() else torch.channels_last
+        x = x.to(computing_dtype(x), memory_format=layout)
         skips = [x]
         for level, block in enumerate(self.encoder):
             x = block(x)

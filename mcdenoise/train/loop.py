@@ -168,7 +168,7 @@ def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> bool:
     """Run the model on the first frames of a clip, so that errors show before the run begins: has it a state?"""
     state: State = None
     try:
-        with torch.no_grad(), fabric.autocast():
+        with fabric.autocast():
             for frame in map(clip.frame, range(min(2, len(clip)))):
                 output, state = model(frame, state)
             images = {"image": output.image, **output.stages}
@@ -182,6 +182,10 @@ def _tried(name: str, model: Model, clip: Clip, fabric: Fabric) -> bool:
         if image.shape != frame.color.shape:
             sizes = f"of {tuple(frame.color.shape)}, found {tuple(image.shape)}"
             raise InputError(f"model '{name}': expected the stage '{stage}' {sizes}")
+    if not any(image.requires_grad for image in images.values()):
+        raise InputError(
+            f"model '{name}': expected an image with derivatives in its weights, found one without; look for .detach()"
+        )
     return state is not None
 
 

@@ -153,6 +153,16 @@ def test_images_of_a_batch_do_not_see_each_other(name: str) -> None:
         torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", [name for name in KINDS if name not in ("oidn", "oidn_temporal")])
+@torch.no_grad()
+def test_vmap_is_a_batch(name: str) -> None:
+    model = small(name)
+    frame = whole_frame(model, 17, 20, batch=2)
+    apart = pytree.tree_map(lambda image: image[:, None], frame)
+    mapped = torch.func.vmap(lambda each: model(each)[0].image)(apart)
+    torch.testing.assert_close(mapped[:, 0], model(frame)[0].image, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("name", KINDS)
 @torch.no_grad()
 def test_hints_change_no_image(name: str) -> None:

@@ -258,8 +258,11 @@ def test_tensors_without_values_are_refused() -> None:
 
 
 def test_the_output_keeps_the_layers_of_void_pixels() -> None:
+    """As far as they hold light: what is NaN there is black, as in the image."""
     color, valid = charts()
-    frame = Frame(color, mask=valid, layers={"all": color})
+    broken = color.index_fill(2, torch.tensor([0]), torch.nan)
+    frame = Frame(broken, mask=valid, layers={"all": broken})
+    assert not valid[..., 0, :].any()
     filled, void = without_void(frame)
     output = with_void(mcdenoise.models.Output(filled.color, layers=dict(filled.layers)), frame, void)
     assert torch.equal(output.image, color)

@@ -67,6 +67,11 @@ class Cropped(Scaled):
         return super().forward(color)[..., ::2]
 
 
+class Detached(Scaled):
+    def forward(self, color: Tensor) -> Tensor:
+        return super().forward(color).detach()
+
+
 def broken() -> nn.Module:
     class Broken(Scaled):
         def forward(self, color: Tensor, curvature: Tensor) -> Tensor:

@@ -111,6 +111,7 @@ def test_a_module_of_four_buffers_learns_and_denoises(small_sequence: Path, tmp_
         ("broken", {}, "expected curvature to train this model on, found no curvature"),
         ("forgetful", {}, "fails on a frame of color, motion, reference: RuntimeError: the state is gone"),
         ("Cropped", {}, "expected the stage 'image' of (1, 3, 16, 16), found (1, 3, 16, 8)"),
+        ("Detached", {}, "expected an image with derivatives in its weights, found one without"),
         ("plain", {"settings": "height=3"}, "got an unexpected keyword argument 'height'; it takes width"),
         ("without_weights", {}, "expected one that learns, found one without weights"),
         ("no_such", {}, "expected a factory 'no_such'"),

@@ -128,8 +128,8 @@ def _examine_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
         shot.drops_positions = True
         if len(shot.numbers) > 1:
             shot.warnings.append(
-                f"'position': no pinhole camera sees them at their pixels, and there is no {MATRICES}: not used; write "
-                "that file, or motion"
+                f"'position': they tell no pinhole camera, as points of one plane do not, and there is no {MATRICES}: "
+                "not used; write that file, or motion"
             )
     elif not shot.positions_of_camera and _is_origin(found, position, known) and _ends_at_origin(shot):
         if world_to_camera(shot.metadata(shot.examined)) is not None:

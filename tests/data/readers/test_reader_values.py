@@ -292,6 +292,9 @@ def test_motion_in_files_is_told_by_the_frames(tmp_path: Path) -> None:
         save(tmp_path / "vector" / f"a.{number}.exr", {k: v for k, v in channels.items() if k[:2] != "mv"} | vector)
         wrong = np.random.default_rng(number).uniform(-20, 20, (2, 60, 100))
         save(tmp_path / "wrong" / f"a.{number}.exr", channels | {"mv.X": wrong[0], "mv.Y": wrong[1]})
+        # Redshift's, where vectors are not raw, of at most 64 pixels.
+        picture = {f"mv.{name}": np.full((60, 100), each / 128 + 0.5) for name, each in zip("XY", SHIFT, strict=True)}
+        save(tmp_path / "picture" / f"a.{number}.exr", channels | picture)
     for folder, words in (
         ("parts", "current - previous, y down, parts of the image"),
         ("vector", "previous - current, y down, pixels"),
@@ -307,6 +310,7 @@ def test_motion_in_files_is_told_by_the_frames(tmp_path: Path) -> None:
     assert "motion" not in sequence.buffers
     assert sequence.frame(1).motion is None
     assert any("does not lead to what looks alike" in warning for warning in sequence.warnings)
+    assert any("where 0.5 stands for no motion" in warning for warning in open_sequence(tmp_path / "picture").warnings)
 
 
 def test_zero_motion_is_dropped_where_the_camera_moves(others: Any, tmp_path: Path) -> None:
