@@ -52,7 +52,6 @@ RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
 YOUNG = 0.35  # probability that a frame has no history
 CALM, CALMEST = 0.5, 1 / 16  # probability that such a frame has less noise than was rendered; the least part of it
-STRANGE = 0.04  # probability that a frame has the features of another one, whose edges its light does not have
 FASTER = 8.0  # factor of the learning rate of layers that begin with random weights
 KEPT = ("network", "average", "optimizer")
 CHANNELS = {"current": 3, "albedo": 3, "normal": 3, "reference": 3}
@@ -175,10 +174,6 @@ def augmented(fixed: Tensor, history: Tensor, rand: Tensor, config: TrainConfig)
     calm = young & (torch.rand_like(factor[:, :1]) < CALM)
     kept, light = CALMEST ** torch.where(calm, torch.rand_like(factor[:, :1]), 0), demodulate(reference, albedo)
     color, recent, current = (light.lerp(image, kept) for image in (color, recent, current))
-    strange = torch.rand_like(factor[:, :1]) < STRANGE
-    theirs, normal = (torch.where(strange, image.roll(1, 0), image) for image in (albedo, normal))
-    color, recent, current = (demodulate(remodulate(image, albedo), theirs) for image in (color, recent, current))
-    albedo = theirs
     if config.lamps:
         inside, radiance, grey = lamps(reference, rand, config)
         albedo = torch.where(inside, grey, albedo)
