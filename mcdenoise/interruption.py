@@ -26,6 +26,8 @@ _unfinished: set[Path] = set()
 
 # Held while a process is started: one that loses its parent half-way prints why it cannot start.
 _starting = threading.Lock()
+# Set once this process is ending.
+_ending = threading.Event()
 
 
 def start_resource_tracker() -> None:
@@ -155,7 +157,7 @@ def heed_signals(name: str) -> None:
 
 def _wait(number: int, frame: FrameType | None) -> None:
     """Keep the main thread from doing anything more, except to start a process that it has begun to start."""
-    while not _starting.locked():
+    while _ending.is_set() or not _starting.locked():
         time.sleep(1)
 
 
@@ -169,6 +171,7 @@ def _watch(name: str, reading: int, numbers: set[int]) -> NoReturn:
     flushing.start()
     flushing.join(_GRACE)
     _starting.acquire(timeout=_GRACE)
+    _ending.set()
     _end(128 + number)
 
 
