@@ -22,8 +22,6 @@ _NO_WARNING = "ignore:resource_tracker:UserWarning"
 _GRACE = 1.25
 # Incomplete files and folders, to be removed if the process ends early.
 _unfinished: set[Path] = set()
-
-
 # Held while a process is started: one that loses its parent half-way prints why it cannot start.
 _starting = threading.Lock()
 # Set once this process is ending.
