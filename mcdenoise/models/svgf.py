@@ -97,7 +97,9 @@ def variance_of(moments: Tensor, length: Tensor, frame: Frame) -> Tensor:
         frame: with the normals and depths of these pixels.
     """
     few = moments_variance(moments, frame.normal, frame.depth, kernel_size=WINDOW) * (_FEW_FRAMES / length)
-    return torch.lerp(moments_variance(moments), few, (_FEW_FRAMES - length).clamp(0, 1))
+    variance = torch.lerp(moments_variance(moments), few, (_FEW_FRAMES - length).clamp(0, 1))
+    # The error of rounded luminance, by which even light would stop the filter, also that of its layers.
+    return variance + (16 * torch.finfo(moments.dtype).eps) ** 2 * moments[:, 1:]
 
 
 svgf = register_model("svgf", kind="filter", paper="Schied et al. 2017")(behind(Demodulated, Svgf))

@@ -4,12 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from mcdenoise import ops
 from mcdenoise.denoiser import Denoiser
 from mcdenoise.frame import Frame
 from mcdenoise.models import create_model
 from mcdenoise.models._history import Past
 from mcdenoise.models.svgf import Svgf, variance_of
 from mcdenoise.ops import atrous, luminance_moments, moments_variance
+from mcdenoise.ops._backend import Backend
 
 HEIGHT, WIDTH = 24, 40
 
@@ -83,7 +85,9 @@ def test_the_first_level_feeds_the_history() -> None:
 
 def test_the_variance_is_that_of_neighbours_where_the_history_is_short() -> None:
     """After three equal frames the variance in time is zero, and so would the filter be; after four it is."""
-    noise = frame()
+    # No two pixels are alike, which a filter of zero width would still average.
+    levels = torch.randperm(HEIGHT * WIDTH, generator=torch.Generator().manual_seed(0)).reshape(1, 1, HEIGHT, WIDTH)
+    noise = frame((levels / 100.0).expand(-1, 3, -1, -1))
     model, state, images = Svgf(), None, []
     for _ in range(6):
         if state is not None:
@@ -101,6 +105,20 @@ def test_rounding_of_the_length_hardly_changes_the_variance() -> None:
     moments = torch.cat([0.5 * torch.ones_like(length), torch.rand(1, 1, HEIGHT, WIDTH) + 0.25], 1)
     exact, rounded = (variance_of(moments, each, given) for each in (length, length - 4e-7))
     torch.testing.assert_close(rounded, exact, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["svgf", "asvgf"])
+@pytest.mark.parametrize("backend", ["torch", "numba"])
+def test_layers_of_even_light_are_filtered(name: str, backend: Backend) -> None:
+    """The light has no variance, and its luminance differs by rounding only."""
+    slope = torch.linspace(2, 3, WIDTH).expand(1, 1, HEIGHT, WIDTH)
+    with ops.use(backend):
+        denoiser, even = Denoiser(name), torch.tensor([0.37, 0.26, 0.11]).reshape(1, 3, 1, 1)
+        for seed in range(4):
+            given = frame(even.expand(1, 3, HEIGHT, WIDTH), depth=slope, motion=torch.full((1, 2, HEIGHT, WIDTH), 0.3))
+            part = torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
+            layer = denoiser.output(given.replace(layers={"part": 0.1 * part})).layers["part"]
+    assert layer.var() < 1e-3 * (0.1 * part).var()
 
 
 def test_a_frame_without_motion_has_no_history() -> None:
