@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from toys import Same, cascade, frame_of, one_of_each, small, still, whole_frame
 
 from mcdenoise import Denoiser, Frame
-from mcdenoise.models import Accumulated, Demodulated, Exposed, Output, Skipping, Tiled, list_models
+from mcdenoise.models import Accumulated, Chain, Demodulated, Exposed, Output, Skipping, Tiled, list_models
 from mcdenoise.models._layers import REST, closed, fractions, split
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models.joint_bilateral import JointBilateral
@@ -203,6 +203,12 @@ def test_the_unit_of_light_does_not_change_its_parts() -> None:
     color = frame_of(*SIZE).color * 2.0**-40
     layers = closed(Frame(color, layers={"diffuse": color / 2}), FrameReport().ask).layers
     assert all(torch.equal(layers[name], color / 2) for name in ("diffuse", REST))
+    # Nor where a method without kernels is inside one whose exposure it has, so that the image is split there.
+    (given,), model = shot(Noisy(), 1), Exposed(Chain(first=Same(), last=Noisy()))
+    brighter = given.replace(color=1024 * given.color, layers={n: 1024 * each for n, each in given.layers.items()})
+    parts, others = (model(frame)[0].layers for frame in (given, brighter))
+    for name, part in parts.items():
+        torch.testing.assert_close(others[name], 1024 * part, rtol=1e-5, atol=1e-6)
 
 
 def test_other_layers_than_before_are_refused_within_a_shot() -> None:
