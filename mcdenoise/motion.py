@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mcdenoise.frame import Frame
 
@@ -69,15 +70,22 @@ class Convention(NamedTuple):
     def moves(self, motion: Image, least: float) -> int:
         """The number of pixels that move more than this in x or y, of those with a motion."""
         with np.errstate(invalid="ignore", over="ignore"):
-            moved = np.abs(self.apply(motion)).max(-1)
+            moved = _longer(self.apply(motion))
             return int(((moved > least) & (moved < np.inf)).sum())
 
 
 def _is_known(motion: Image) -> Mask:
     """``(H, W)`` where a motion is neither infinite, as in a background, nor NaN, nor huge."""
     with np.errstate(invalid="ignore"):
-        known: Mask = np.abs(motion[..., :2]).max(-1) < _LARGEST_MOTION
+        known: Mask = _longer(motion) < _LARGEST_MOTION
     return known
+
+
+def _longer(motion: Image) -> Image:
+    """``(H, W)`` the longer of both sides of a motion; NaN if one is."""
+    # The maximum over the last axis takes five times as long.
+    found: Image = np.maximum(np.abs(motion[..., 0]), np.abs(motion[..., 1]))
+    return found
 
 
 def _is_around_half(motion: Image) -> bool:
@@ -155,7 +163,8 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
-    best, errors, at_rest = _compare(pairs, candidates)
+    sampled = [(now, before, motion[:: (step := _step(motion.shape)), ::step]) for now, before, motion in pairs]
+    best, errors, at_rest = _compare(sampled, candidates)
     better = errors[best] < _BETTER * errors[given]
     # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
@@ -170,7 +179,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
 def _compare(
     pairs: Sequence[Pair], candidates: Sequence[Convention]
 ) -> tuple[Convention, dict[Convention, float], float]:
-    """The best convention, the mean :func:`_mismatch` of each, and that of no motion."""
+    """The best convention, the mean :func:`_mismatch` of each, and that of no motion; of motion in sampled pixels."""
     *errors, at_rest = (float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in (*candidates, _AT_REST))
     found = dict(zip(candidates, errors, strict=True))
     # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
@@ -215,11 +224,10 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
 
     Only pixels with a motion are compared, so that a background without one is no argument for rest. A pixel led
     outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a motion that
-    leads every pixel outside is rejected.
+    leads every pixel outside is rejected. The motion is that of the pixels that :func:`_step` samples.
     """
-    height, width = motion.shape[:2]
-    step = max(1, int(np.sqrt(height * width / _COMPARED)))
-    moved = convention.apply(motion[::step, ::step])
+    height, width, _ = next(iter(now.values())).shape
+    step, moved = _step((height, width)), convention.apply(motion)
     rows, columns = np.mgrid[:height:step, :width:step]
     x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
     y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
@@ -236,6 +244,11 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
     return total
 
 
+def _step(size: Sequence[int]) -> int:
+    """Every so manyth row and column of an image has about as many pixels as are compared."""
+    return max(1, int(np.sqrt(size[0] * size[1] / _COMPARED)))
+
+
 def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
     """Median reprojection error in pixels of a row-vector matrix with clip y down."""
     points, pixels, size = sampled(position, seen)
@@ -246,11 +259,15 @@ def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
     return float(np.median(errors))
 
 
-def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
-    """``(H, W, 2)`` pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN."""
+def motion_to(matrix: Array, position: Image | Array, seen: Mask, step: int = 1) -> Array:
+    """``(H, W, 2)`` pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN.
+
+    With ``step``, only those of every so manyth row and column.
+    """
     height, width = seen.shape
-    rows, columns = np.mgrid[:height, :width]
-    clip = np.where(seen[..., None], position, np.nan) @ matrix[:3] + matrix[3]
+    rows, columns = np.mgrid[:height:step, :width:step]
+    points = np.where(seen[::step, ::step, None], position[::step, ::step], np.nan)
+    clip = points @ matrix[:3] + matrix[3]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
     result: Array = pixels - np.stack([columns, rows], -1)
@@ -297,15 +314,16 @@ class Seen(NamedTuple):
 def seen_in(frame: Frame) -> Seen:
     """Copies of what :func:`doubt_motion` needs of the first frame of a batch, on a CPU."""
     names = [name for name in ("albedo", "normal") if frame.buffer(name) is not None] or ["color"]
-    features = {name: _smoothed(np.clip(np.nan_to_num(_pixels(frame, name)), -1, 1)) for name in names}
+    features = {name: _smoothed(_buffer(frame, name)) for name in names}
     matrix = frame.view_projection
     return Seen(features, None if matrix is None else matrix[0].detach().double().numpy().copy())
 
 
-def _smoothed(image: Image) -> Image:
+def _smoothed(image: Tensor) -> Image:
     """Means of 3x3 pixels: noise that a motion interpolates is a fifth less unlike any noise than noise itself."""
-    means = F.avg_pool2d(torch.from_numpy(image).movedim(-1, 0), 3, stride=1, padding=1, count_include_pad=False)
-    return means.movedim(0, -1).contiguous().numpy()
+    valid = image.nan_to_num().clamp(-1, 1)
+    means: Image = F.avg_pool2d(valid, 3, stride=1, padding=1, count_include_pad=False).movedim(0, -1).numpy()
+    return means
 
 
 def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
@@ -337,10 +355,12 @@ def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
             continue
         if name == "position" and frame.previous_position is not None:
             continue
-        stored = _pixels(frame, name)
-        if name != "motion":
+        step = _step(frame.size)
+        if name == "motion":
+            stored = _pixels(frame, name)[::step, ::step]
+        else:
             assert before.camera is not None
-            stored = motion_to(before.camera, stored, _hit(frame)).astype(np.float32)
+            stored = motion_to(before.camera, _pixels(frame, name), _hit(frame), step).astype(np.float32)
         if reason := _contradiction((now, before.features, stored)):
             source = "'motion'" if name == "motion" else f"'{name}' with the previous 'view_projection'"
             meaning = "previous = current + motion in pixels, x right, y down"
@@ -350,9 +370,9 @@ def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
 
 def _contradiction(pair: Pair) -> str:
     """Why a motion cannot be right: another reading of it must be better than it and than no motion."""
-    *_, motion = pair
+    now, *_, motion = pair
     # The first one is the usual convention.
-    usual, *others = conventions(motion.shape[:2], motion)
+    usual, *others = conventions(next(iter(now.values())).shape[:2], motion)
     turned = [each._replace(words=f"x and y swapped, {each.words}", swapped=True) for each in (usual, *others[:3])]
     candidates = [usual, *others, *turned]
     if max(each.moves(motion, _MOVES) for each in candidates) < _LEAST_MOVING:
@@ -363,16 +383,23 @@ def _contradiction(pair: Pair) -> str:
     return ""
 
 
-def _pixels(frame: Frame, name: str) -> Image:
+def _buffer(frame: Frame, name: str) -> Tensor:
+    """``(C, H, W)`` of the first frame of a batch."""
     image = frame.buffer(name)
     assert image is not None
-    return np.ascontiguousarray(image[0].detach().float().permute(1, 2, 0).numpy())
+    return image[0].detach().float()
+
+
+def _pixels(frame: Frame, name: str) -> Image:
+    pixels: Image = _buffer(frame, name).movedim(0, -1).numpy()
+    return pixels
 
 
 def _hit(frame: Frame) -> Mask:
     """Where a surface was hit, as far as the buffers tell."""
-    hit: Mask = (_pixels(frame, "position") != 0).any(-1)
-    return hit if frame.depth is None else hit & np.isfinite(_pixels(frame, "depth")[..., 0])
+    hit = (_buffer(frame, "position") != 0).any(0)
+    found: Mask = (hit if frame.depth is None else hit & _buffer(frame, "depth")[0].isfinite()).numpy()
+    return found
 
 
 def sampled(position: Image | Array, seen: Mask) -> tuple[Array, Array, Array]:
@@ -391,5 +418,5 @@ def misses(homogeneous: Array, matrix: Array, screen: Array, size: Array) -> Arr
     clip = homogeneous @ matrix
     with np.errstate(divide="ignore", invalid="ignore"):
         missed = np.linalg.norm((clip[:, :2] / clip[:, 2:] - screen) * size / 2, axis=1)
-    result: Array = np.nan_to_num(missed, nan=np.inf)
+    result: Array = np.nan_to_num(missed, nan=np.inf, posinf=np.inf)
     return result

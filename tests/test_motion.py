@@ -91,6 +91,13 @@ RIGHT: dict[str, dict[str, Any]] = {
 }
 
 
+def test_a_camera_that_no_other_reading_fits_is_read_without_a_warning() -> None:
+    """Read as its transpose, it projects all points to infinity."""
+    frame = next(shot())
+    frame.view_projection[..., 3, 2] = 0
+    assert told([frame]) == [""]
+
+
 @pytest.mark.parametrize("scene", RIGHT)
 @pytest.mark.parametrize(
     ("ways", "without"), [(by_motion, ("albedo",)), (by_cameras, ())], ids=["motion, color", "cameras, features"]
