@@ -96,8 +96,8 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
     if spread:
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
-            "as Mitsuba's default does; many denoisers leave such noise in, OIDN most: render with a box filter, or "
-            "use the model oidn_temporal"
+            "as Mitsuba's default does; most denoisers, and OIDN most of all, leave such noise in: render with a box "
+            "filter, or use the models wild, wild_large or oidn_temporal"
         )
     if albedo is None:
         words.append("radiance")
