@@ -163,7 +163,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
-    sampled = [(now, before, motion[:: (step := _step(motion.shape)), ::step]) for now, before, motion in pairs]
+    sampled = [(now, before, motion[:: (step := grid_step(motion.shape)), ::step]) for now, before, motion in pairs]
     best, errors, at_rest = _compare(sampled, candidates)
     better = errors[best] < _BETTER * errors[given]
     # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
@@ -190,7 +190,7 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
     """Find the motion convention that agrees with the projection of this frame's points by the previous camera.
 
     Args:
-        pairs: stored motion, and ``(H, W, 2)`` pixels to the previous projection of the points, or NaN.
+        pairs: stored motion, and pixels to the previous projection of the points, or NaN, see :func:`motion_to`.
         given: the usual convention of the format.
 
     Returns:
@@ -199,9 +199,10 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
     if not pairs:
         return None
     given, candidates = _candidates([motion for motion, _ in pairs], given)
+    sampled = [(motion[:: (step := grid_step(motion.shape)), ::step], seen) for motion, seen in pairs]
 
     def missed(convention: Convention) -> float:
-        away = [np.linalg.norm(convention.apply(motion) - seen, axis=-1) for motion, seen in pairs]
+        away = [np.linalg.norm(convention.apply(motion) - seen, axis=-1) for motion, seen in sampled]
         return float(np.mean([np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 0 for each in away]))
 
     errors = {each: missed(each) for each in candidates}
@@ -224,10 +225,10 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
 
     Only pixels with a motion are compared, so that a background without one is no argument for rest. A pixel led
     outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a motion that
-    leads every pixel outside is rejected. The motion is that of the pixels that :func:`_step` samples.
+    leads every pixel outside is rejected. The motion is that of the pixels that :func:`grid_step` samples.
     """
     height, width, _ = next(iter(now.values())).shape
-    step, moved = _step((height, width)), convention.apply(motion)
+    step, moved = grid_step((height, width)), convention.apply(motion)
     rows, columns = np.mgrid[:height:step, :width:step]
     x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
     y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
@@ -244,7 +245,7 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
     return total
 
 
-def _step(size: Sequence[int]) -> int:
+def grid_step(size: Sequence[int]) -> int:
     """Every so manyth row and column of an image has about as many pixels as are compared."""
     return max(1, int(np.sqrt(size[0] * size[1] / _COMPARED)))
 
@@ -259,15 +260,15 @@ def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
     return float(np.median(errors))
 
 
-def motion_to(matrix: Array, position: Image | Array, seen: Mask, step: int = 1) -> Array:
-    """``(H, W, 2)`` pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN.
+def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
+    """Pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN.
 
-    With ``step``, only those of every so manyth row and column.
+    Returns:
+        ``(H', W', 2)`` of every row and column that :func:`grid_step` samples.
     """
-    height, width = seen.shape
+    (height, width), step = seen.shape, grid_step(seen.shape)
     rows, columns = np.mgrid[:height:step, :width:step]
-    points = np.where(seen[::step, ::step, None], position[::step, ::step], np.nan)
-    clip = points @ matrix[:3] + matrix[3]
+    clip = np.where(seen[::step, ::step, None], position[::step, ::step], np.nan) @ matrix[:3] + matrix[3]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
     result: Array = pixels - np.stack([columns, rows], -1)
@@ -355,12 +356,12 @@ def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
             continue
         if name == "position" and frame.previous_position is not None:
             continue
-        step = _step(frame.size)
+        stored = _pixels(frame, name)
         if name == "motion":
-            stored = _pixels(frame, name)[::step, ::step]
+            stored = stored[:: (step := grid_step(frame.size)), ::step]
         else:
             assert before.camera is not None
-            stored = motion_to(before.camera, _pixels(frame, name), _hit(frame), step).astype(np.float32)
+            stored = motion_to(before.camera, stored, _hit(frame)).astype(np.float32)
         if reason := _contradiction((now, before.features, stored)):
             source = "'motion'" if name == "motion" else f"'{name}' with the previous 'view_projection'"
             meaning = "previous = current + motion in pixels, x right, y down"
