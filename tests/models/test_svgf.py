@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from planes import exponential
 from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
@@ -16,9 +17,7 @@ HEIGHT, WIDTH = 24, 40
 
 def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Frame:
     """A still corner of two walls, lit by noise of mean 1."""
-    generator = torch.Generator().manual_seed(seed)
-    if light is None:
-        light = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=generator).clamp_min(1e-6))
+    light = exponential(1, 3, HEIGHT, WIDTH, seed=seed) if light is None else light
     right = (torch.arange(light.shape[-1]) >= light.shape[-1] // 2).expand(1, 1, *light.shape[-2:])
     normal = torch.cat([right, torch.zeros_like(right), ~right], 1).to(light.dtype)
     buffers = {
@@ -101,14 +100,6 @@ def test_rounding_of_the_length_hardly_changes_the_variance() -> None:
     moments = torch.cat([0.5 * torch.ones_like(length), torch.rand(1, 1, HEIGHT, WIDTH) + 0.25], 1)
     exact, rounded = (variance_of(moments, each, given) for each in (length, length - 4e-7))
     torch.testing.assert_close(rounded, exact, rtol=1e-4, atol=1e-6)
-
-
-def test_a_frame_without_motion_has_no_history() -> None:
-    denoiser = Denoiser("svgf")
-    for seed in (0, 1):
-        given = frame(seed=seed).replace(motion=None)
-        torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
-    assert denoiser.report.reset == "no motion, and no position with a previous camera"
 
 
 @pytest.mark.parametrize("sigma_n", [1.0, 1.5, 128.0])
