@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 import torch
 from refusals import refused
-from small import small_model
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Mean, Same
+from toys import Mean, Same, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.data import open_sequence
@@ -62,7 +61,7 @@ def test_missing_features_are_told() -> None:
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), normal=torch.zeros(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth"]
     # Motion is one missing buffer, whichever buffers could provide it.
-    denoiser = Denoiser(small_model())
+    denoiser = Denoiser(small("cascaded"))
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
     assert "\nmissing: albedo, depth, motion, normal\n" in str(denoiser.report)
@@ -73,7 +72,7 @@ def test_missing_features_are_told() -> None:
 
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position", "motion"])
 def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
-    denoiser = Denoiser(small_model())
+    denoiser = Denoiser(small("cascaded"))
     denoiser(frames[0])
     given = getattr(frames[1], name)
     broken = torch.zeros_like(frames[1].color[:, :2]) if given is None else given.clone()
@@ -233,7 +232,7 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
 
 
 def test_derivatives_go_through_the_state_and_leave_the_images_as_they_are(frames: list[Frame]) -> None:
-    model = small_model()
+    model = small("cascaded")
     color = frames[0].color.clone().requires_grad_()
     ordinary, differentiable = Denoiser(model), Denoiser(model, differentiable=True)
     shot = [frames[0].replace(color=color), *frames[1:]]
