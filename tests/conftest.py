@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small import small_model
 from torch import Tensor
+from toys import small
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.color_space import import_colour
@@ -68,7 +68,7 @@ def out(tmp_path: Path) -> Path:
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
     path = tmp_path / "small.safetensors"
-    path.write_bytes(save_weights(small_model(), "cascaded", {"width": 8}, {}))
+    path.write_bytes(save_weights(small("cascaded"), "cascaded", {"width": 8}, {}))
     return path
 
 

@@ -57,17 +57,20 @@ def random_shot(seed: int, height: int = 80, width: int = 112, frames: int = 3) 
     return [Frame(color=images(3), **still) for _ in range(frames)]
 
 
+def exponential(*size: int, seed: int) -> Tensor:
+    """Noise of mean 1, as that of single paths."""
+    return -torch.log(torch.rand(size, generator=torch.Generator().manual_seed(seed)).clamp_min(1e-6))
+
+
 def synthetic(width: int, height: int, seed: int = 0) -> Frame:
     """Noise on a checkered floor under a sky that nothing is hit in, with motion."""
-    generator = torch.Generator().manual_seed(seed)
     rows, columns = torch.meshgrid(torch.arange(height) / height, torch.arange(width) / height, indexing="ij")
     floor = (rows > 0.3)[None, None]
     checker = ((rows * 8).floor() + (columns * 8).floor()) % 2
-    noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
     albedo = (0.2 + 0.6 * checker).expand(1, 3, -1, -1) * floor
     normal = torch.tensor([0.0, 1.0, 0.0]).reshape(1, 3, 1, 1) * floor
     return Frame(
-        color=torch.where(floor, albedo * noise, 0.7),
+        color=torch.where(floor, albedo * exponential(1, 3, height, width, seed=seed), 0.7),
         albedo=albedo,
         normal=normal,
         depth=torch.where(floor, 1 / rows.clamp_min(0.1), torch.inf),

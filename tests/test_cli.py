@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import refuses, run
+from commands import refuses, run, silently
 from pictures import edit
 
 from mcdenoise.benchmark.sizes import synthetic_frame
 from mcdenoise.cli import COMMANDS
 from mcdenoise.data import open_sequence, read_exr
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
+from mcdenoise.engines import LocalEngine
 from mcdenoise.models import list_models
 from mcdenoise.models._weights import pretrained_models
 
@@ -41,8 +42,7 @@ def test_help_is_complete_short_and_plain() -> None:
     """Every option has a description, none has markup of the source, and they stay few enough to be read."""
     options = 0
     for command in COMMANDS:
-        status, text, errors = run(command, "--help")
-        assert (status, errors) == (0, "")
+        text = silently(command, "--help")
         assert not re.search(r":[a-z]+:|``|\{None\}", text), command
         assert not re.search(r"--[a-z-]+ [^ ]+ +\((?:default|required)", text), command
         options += len(set(re.findall(r"^│ (?:-\w(?: \w+)?, )?(--[a-z-]+)", text, re.MULTILINE)) - {"--help"})
@@ -51,24 +51,18 @@ def test_help_is_complete_short_and_plain() -> None:
 
 
 def test_summary_and_version() -> None:
-    status, text, _ = run("--help")
-    assert status == 0
+    text = silently("--help")
     assert all(re.search(rf"^  {command} +[A-Z].*\.$", text, re.MULTILINE) for command in COMMANDS)
     assert run()[0] == 2
-    status, text, _ = run("--version")
-    assert status == 0
-    assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", text)
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*\n", silently("--version"))
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["denoise"], ": expected --out PATH, found none; see"),
-        (
-            ["denoise", "somewhere", "--ot", "out"],
-            "expected --out PATH, found none; unrecognized options: --ot out; see",
-        ),
-        (["evaluate"], ": expected SEQUENCE, found none; see"),
+        (["denoise"], "--out"),
+        (["denoise", "somewhere", "--ot", "out"], "--ot"),
+        (["evaluate"], "SEQUENCE"),
         (["denoise", "somewhere", "-o", "out", "--threads", "many"], "--threads"),
         (["models", "--json"], "--json"),
     ],
@@ -97,11 +91,7 @@ def test_unknown_command() -> None:
         ("--output-layer", "clean --layers all", "found --layers"),
         ("--device", "abacus", "device 'abacus': expected one that torch can use"),
         ("--model", "kp", "expected weights of model 'kp', found those of 'cascaded'"),
-        (
-            "--model",
-            "wild(hue=1)",
-            "argument 'hue': expected an argument of Denoiser or a setting of model 'wild' (size, ",
-        ),
+        ("--model", "wild(hue=1)", "argument 'hue': expected an argument of Denoiser or a setting of model 'wild'"),
         ("--model", "wild_smal", "model 'wild_smal': found no model of this name; did you mean wild_small or "),
         ("--model", "joint_bilateral(sigma_color=1", "expected ')' after the settings, found none; add it"),
         ("--weights", "nothing.safetensors", "nothing.safetensors: expected a safetensors file"),
@@ -130,8 +120,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_anything_is_printed(
 
 def test_the_users_folder_in_quotes(small_sequence: Path, weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(small_sequence.parent))
-    status, _, errors = run("denoise", f"~/{small_sequence.name}", "-o", "~/a", "--weights=~/small.safetensors")
-    assert (status, errors) == (0, "")
+    silently("denoise", f"~/{small_sequence.name}", "-o", "~/a", "--weights=~/small.safetensors")
     assert (weights.parent / "a" / "denoise.json").is_file()
 
 
@@ -155,8 +144,7 @@ def mine(tmp_path: Path) -> Path:
 
 def test_a_users_model(small_sequence: Path, mine: Path, out: Path) -> None:
     for name in ("blur", "blur(radius=2)"):
-        status, _, errors = run("denoise", small_sequence, "-o", out / name, "--model", f"{mine}:{name}")
-        assert (status, errors) == (0, "")
+        silently("denoise", small_sequence, "-o", out / name, "--model", f"{mine}:{name}")
         report = json.loads((out / name / "denoise.json").read_text())
         assert report["model"] == f"mine.py:{name}"
         assert report["tolerance"] is None
@@ -237,8 +225,7 @@ def test_names_that_the_standard_output_cannot_show(small_sequence: Path, tmp_pa
 
 def test_denoise(denoise: list[Any], out: Path, tmp_path: Path) -> None:
     figures = tmp_path / "times.json"
-    status, text, errors = run(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures, "--keep-all")
-    assert (status, errors) == (0, "")
+    text = silently(*denoise, "--frames", "1,3", "--threads", "1", "--json", figures, "--keep-all")
     assert "plane: bmfr layout, 2 frames, 1 to 3, of 24x20" in text
     assert "accumulate: kept (positions and cameras)" in text
     assert "milliseconds a frame" in text
@@ -257,8 +244,7 @@ def test_invalid_colors_are_replaced_and_counted(denoise: list[Any], small_seque
         pixels[15, 7, 0] = 3e38
 
     edit(small_sequence / "inputs" / "color1.exr", spoil)
-    status, text, errors = run(*denoise)
-    assert (status, errors) == (0, "")
+    text = silently(*denoise)
     assert "replaced 4 NaN, infinite, negative or absurdly bright pixels" in text
     for number in range(4):
         assert np.isfinite(read_exr(out / f"denoised{number}.exr")[0]).all()
@@ -306,8 +292,7 @@ def test_models(tmp_path: Path) -> None:
     path = tmp_path / "models.json"
     listed: dict[str, list[str]] = {}
     for option in ("--json", "--all", "--ops"):
-        status, text, errors = run("models", option, *([] if option == "--json" else ["--json"]), path)
-        assert (status, errors) == (0, "")
+        text = silently("models", option, *([] if option == "--json" else ["--json"]), path)
         listed[option] = [entry["name"] for entry in json.loads(path.read_text())]
         assert all(name in text for name in listed[option])
     assert sorted(listed["--json"]) == sorted(pretrained_models())
@@ -334,8 +319,7 @@ def test_generate(out: Path) -> None:
     # The scene of the first seed has moving objects, that of the second has none.
     command = ["generate", "-o", out, "--seeds", "4,6", "--frames", "2", "--size", "8x8", "--variant", "scalar_rgb"]
     command += ["--assets", "none", "--noise-seeds", "2", "--reference-spp", "2"]
-    status, text, errors = run(*command)
-    assert (status, errors) == (0, "")
+    text = silently(*command)
     folders = [out / "random0004", out / "random0006"]
     assert text.split() == [str(folder / "inputs") for folder in folders]
     for folder, moves in zip(folders, (True, False), strict=True):
@@ -350,6 +334,23 @@ def test_generate(out: Path) -> None:
     assert len(times) == 2 * 2 * 7 + 2
     assert run(*command)[:2] == (0, text)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.exr")} == times
+
+
+def test_a_cluster_generates_the_same(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each seed is a task; what becomes of tasks on lost nodes is tested with films."""
+    pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
+    asked: list[str] = []
+    cluster = lambda address, **_: asked.append(address) or LocalEngine(1)  # noqa: E731
+    monkeypatch.setattr("mcdenoise.cli.generate.RayEngine", cluster)
+    small = "--assets none --seeds 4,6 --frames 1 --size 8x8 --variant scalar_rgb --noise-seeds 1 --reference-spp 2"
+    found = []
+    for workers in ("1", "10.0.0.1:6379"):
+        place = out / str(len(found))
+        assert run(f"generate {small} -o {place} --workers {workers}")[0] == 0
+        found.append({path.relative_to(place): read_exr(path)[0].tobytes() for path in place.rglob("*.exr")})
+    assert found[0] == found[1]
+    assert found[0]
+    assert asked == ["10.0.0.1:6379"]
 
 
 @pytest.mark.parametrize(

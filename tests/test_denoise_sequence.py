@@ -11,8 +11,8 @@ import pytest
 import torch
 from pictures import channels_of
 from refusals import refused
-from small import small_model
 from torch import Tensor, nn
+from toys import small
 
 from mcdenoise import Denoiser, Frame
 from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
@@ -26,9 +26,9 @@ def test_a_sequence_is_written_with_its_numbers_and_metadata(small_sequence: Pat
     for number in sequence.numbers:
         color = small_sequence / "inputs" / f"color{number}.exr"
         write_exr(color, read_exr(color)[0], ["R", "G", "B"], metadata={"Owner": f"frame {number}", "camera": 1.5})
-    denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    denoise_sequence(sequence, out, Denoiser(small("cascaded")), "small")
     assert sorted(path.name for path in out.iterdir()) == ["denoise.json", "denoised1.exr", "denoised2.exr"]
-    denoiser = Denoiser(small_model())
+    denoiser = Denoiser(small("cascaded"))
     for number in sequence.numbers:
         pixels, channels, metadata = read_exr(out / f"denoised{number}.exr")
         assert channels == ["R", "G", "B"]
@@ -129,7 +129,7 @@ def test_reading_ahead_does_not_change_an_image(
 ) -> None:
     sequence = open_sequence(small_sequence)
     for name, ahead in (("ahead", True), ("alone", False)):
-        denoiser = Denoiser(small_model())
+        denoiser = Denoiser(small("cascaded"))
         monkeypatch.setattr(type(denoiser._tiles), "has_room_ahead", lambda *_, room=ahead: room)
         denoise_sequence(sequence, tmp_path / name, denoiser, "small", full_float=True)
         assert denoiser.has_room_ahead is ahead
@@ -145,7 +145,7 @@ def test_a_frame_that_cannot_be_written_ends_the_run(
     out = tmp_path / "out"
     (out / f"denoised{failing}.exr").mkdir(parents=True)
     sequence = open_sequence(small_sequence)
-    message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small_model()), "small"))
+    message = refused(lambda: denoise_sequence(sequence, out, Denoiser(small("cascaded")), "small"))
     assert f"denoised{failing}.exr: expected a file to write" in message
     whole = sorted(path.name for path in out.iterdir() if path.is_file())
     assert whole == [f"denoised{number}.exr" for number in range(failing)]
@@ -165,7 +165,7 @@ def test_an_interrupt_leaves_only_whole_files(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        denoise_sequence(open_sequence(small_sequence), out, Denoiser(small_model()), "small", on_frame=interrupt)
+        denoise_sequence(open_sequence(small_sequence), out, Denoiser(small("cascaded")), "small", on_frame=interrupt)
     assert sorted(path.name for path in out.iterdir()) == ["denoised0.exr", "denoised1.exr"]
     for number in range(2):
         assert read_exr(out / f"denoised{number}.exr")[0].shape == (20, 24, 3)
@@ -175,10 +175,10 @@ def test_an_interrupt_leaves_only_whole_files(
 
 def test_an_old_report_does_not_survive_a_run_that_fails(small_sequence: Path, tmp_path: Path) -> None:
     sequence, out = open_sequence(small_sequence), tmp_path / "out"
-    denoise_sequence(sequence, out, Denoiser(small_model()), "small")
+    denoise_sequence(sequence, out, Denoiser(small("cascaded")), "small")
     path = small_sequence / "inputs" / "albedo2.exr"
     path.write_bytes(path.read_bytes()[:-40])
-    refused(denoise_sequence, sequence, out, Denoiser(small_model()), "small")
+    refused(denoise_sequence, sequence, out, Denoiser(small("cascaded")), "small")
     assert not (out / "denoise.json").exists()
 
 

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 import torch
 from refusals import refused
-from small import small_model
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
-from toys import Mean, Same
+from toys import Mean, Same, small
 
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.data import open_sequence
@@ -33,26 +32,6 @@ class Keep(nn.Module):
         return Output(color, {"initial": color * 2})
 
 
-def test_a_module_of_your_own(frames: list[Frame]) -> None:
-    """It works in the wrappers of the zoo."""
-    network = Keep()
-    output = Denoiser(Demodulated(Accumulated(network))).output(frames[0])
-    assert list(output.stages) == ["noisy", "accumulated", "initial"]
-    torch.testing.assert_close(output.image, frames[0].color)
-    assert torch.equal(output.stages["noisy"], frames[0].color)
-    torch.testing.assert_close(output.stages["accumulated"], frames[0].color)
-    torch.testing.assert_close(output.stages["initial"], frames[0].color * 2)
-    # Where there is a texture, the network does not see it.
-    textured = (frames[0].albedo >= 0.04).all(1, keepdim=True)
-    expected = torch.where(textured, frames[0].color / frames[0].albedo.clamp_min(0.04), frames[0].color)
-    torch.testing.assert_close(network.seen["color"], expected)
-    assert torch.equal(network.seen["depth"], frames[0].depth)
-    # Without, it sees the frame as it is.
-    output = Denoiser(network).output(frames[0])
-    assert list(output.stages) == ["noisy", "initial"]
-    assert torch.equal(network.seen["color"], frames[0].color)
-
-
 def test_missing_features_are_told() -> None:
     network = Keep()
     denoiser = Denoiser(network)
@@ -62,7 +41,7 @@ def test_missing_features_are_told() -> None:
     denoiser(Frame(color=torch.rand(1, 3, 9, 7), normal=torch.zeros(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth"]
     # Motion is one missing buffer, whichever buffers could provide it.
-    denoiser = Denoiser(small_model())
+    denoiser = Denoiser(small("cascaded"))
     denoiser(Frame(color=torch.rand(1, 3, 9, 7)))
     assert denoiser.report.missing == ["albedo", "depth", "motion", "normal"]
     assert "\nmissing: albedo, depth, motion, normal\n" in str(denoiser.report)
@@ -73,7 +52,7 @@ def test_missing_features_are_told() -> None:
 
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth", "position", "motion"])
 def test_an_invalid_feature_is_refused_and_leaves_the_history_unchanged(frames: list[Frame], name: str) -> None:
-    denoiser = Denoiser(small_model())
+    denoiser = Denoiser(small("cascaded"))
     denoiser(frames[0])
     given = getattr(frames[1], name)
     broken = torch.zeros_like(frames[1].color[:, :2]) if given is None else given.clone()
@@ -121,16 +100,19 @@ def test_images_and_states_share_no_memory() -> None:
 
     class Last(Same):
         def forward(self, frame: Frame, state: Any = None) -> tuple[Output, Any]:
-            image = frame.color if state is None else state[0]
-            return Output(image, {"frame": frame.color}), (frame.color, image, frame.color[:, :1])
+            image, before = (frame.color, frame.color) if state is None else state
+            return Output(image, {"albedo": frame.albedo, "before": before}), (frame.color, image)
 
     colors = torch.rand(4, 1, 3, 9, 7)
-    place = colors[0].clone()
+    place, albedo = colors[0].clone(), torch.rand(1, 3, 9, 7)
+    same = albedo.clone()
     denoiser, expected = Denoiser(Last()), [colors[0], colors[0], colors[1], colors[2]]
-    for color, image in zip(colors, expected, strict=True):
+    for color, image, before in zip(colors, expected, [colors[0], *expected], strict=False):
         place.copy_(color)
-        output = denoiser.output(Frame(color=place))
+        output = denoiser.output(Frame(color=place, albedo=albedo))
         assert torch.equal(output.image, image)
+        assert torch.equal(output.stages["before"], before)
+        assert torch.equal(output.stages["albedo"], same)
         assert torch.equal(place, color)
         for one in (output.image, *output.stages.values()):
             one.fill_(7.0)
@@ -233,7 +215,7 @@ def test_settings_are_those_of_the_model(weights: Path) -> None:
 
 
 def test_derivatives_go_through_the_state_and_leave_the_images_as_they_are(frames: list[Frame]) -> None:
-    model = small_model()
+    model = small("cascaded")
     color = frames[0].color.clone().requires_grad_()
     ordinary, differentiable = Denoiser(model), Denoiser(model, differentiable=True)
     shot = [frames[0].replace(color=color), *frames[1:]]

@@ -166,16 +166,3 @@ def test_a_frame_comes_apart_and_together(make: object) -> None:
     paths = [pytree.keystr(path) for path, _ in pytree.tree_flatten_with_path(frame)[0]]
     assert paths[0] == ".color"
     assert len(set(paths)) == len(leaves)
-
-
-def test_torch_func_takes_frames() -> None:
-    def loss(frame: Frame) -> Tensor:
-        return (frame.color.square() * frame.depth).sum()
-
-    frame = Frame(color=torch.rand(2, 3, *SIZE), depth=plane(1, 3.0))
-    gradient = torch.func.grad(loss)(frame)
-    assert isinstance(gradient, Frame)
-    torch.testing.assert_close(gradient.color, 6 * frame.color)
-    torch.testing.assert_close(gradient.depth, frame.color.square().sum(1, keepdim=True))
-    mapped = torch.func.vmap(lambda each: 2 * each.color)(pytree.tree_map(lambda value: value[:, None], frame))
-    assert torch.equal(mapped[:, 0], 2 * frame.color)

@@ -165,9 +165,9 @@ def test_a_damaged_description_is_refused(sequence: Path, tmp_path: Path, missin
     assert "camera.json:" in refused(render_sequence, demo_scene(), demo_cameras(9)[:1], tmp_path, **settings)
 
 
-def _furnace(albedo: float = 0.5) -> dict[str, Any]:
+def _furnace() -> dict[str, Any]:
     """A sphere inside a glowing one: the radiance of every pixel is known."""
-    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     return {
         "type": "scene",
         "ball": {"type": "sphere", "radius": 1.0, "bsdf": grey},
@@ -222,10 +222,7 @@ def test_variants_agree_on_what_moves(moving: Path, tmp_path: Path) -> None:
         ({"workers": 0}, "workers: expected at least 1"),
         ({"noise_level": 0.0}, "noise_level: expected more than 0 and less than 1, found 0"),
         ({"moves": {"rug": np.eye(4)}}, "object 'rug': expected 1 matrices"),
-        (
-            {"moves": {"nothing": np.eye(4)[None]}},
-            r"object 'nothing': expected the id of .*\(bench, .* and [0-9]+ more\)",
-        ),
+        ({"moves": {"nothing": np.eye(4)[None]}}, "object 'nothing': .*bench"),
         ({"size": (0, 9)}, "size: expected"),
         ({"size": (16, 100000)}, "size: expected"),
         ({"frames": -1}, "at least one camera"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from planes import synthetic
 from refusals import refused
-from small import small_model
+from toys import small
 
 from mcdenoise import Denoiser
 from mcdenoise.benchmark.memory import output_and_peak
@@ -37,7 +37,7 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
 ) -> None:
     opened = open_sequence(sequence)
     monkeypatch.setattr(type(opened), "frame", lambda *_, **__: pytest.fail("a frame was read"))
-    denoiser = Denoiser(small_model(), max_memory=0.1)
+    denoiser = Denoiser(small("cascaded"), max_memory=0.1)
     message = refused(lambda: denoise_sequence(opened, tmp_path / "out", denoiser, "small"))
     assert message.startswith("max_memory: expected at least")
     assert list((tmp_path / "out").iterdir()) == []

@@ -173,12 +173,13 @@ class Watching(Same):
 
 
 class Seen(NamedTuple):
-    """A record of the frame that a method inside :class:`Accumulated` sees, and why it has no history."""
+    """A record of the frame that a method inside :class:`Accumulated` sees, and what is told of its history."""
 
     color: Tensor
     current: Tensor
     length: Tensor
     reset: str
+    history: float | None
 
 
 class Shot:
@@ -198,5 +199,5 @@ class Shot:
         else:
             with ops.use(self.backend, strict=False):
                 output, self.state = self.model(frame, self.state)
-        seen = self.watching.frames[-1]
-        return Seen(seen.color, seen.current, seen.length, report_of(output).reset)
+        seen, report = self.watching.frames[-1], report_of(output)
+        return Seen(seen.color, seen.current, seen.length, report.reset, report.history)

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from planes import leaning_wall
+from planes import exponential, leaning_wall
 
 from mcdenoise.data.camera_matrices import CameraMatrices, write_camera_matrices
 from mcdenoise.data.exr import read_exr, write_exr
@@ -55,9 +54,8 @@ def write_shot(folder: Path, frames: int, *, width: int = 32, height: int = 20, 
 
 
 def frame(number: int, width: int, height: int, seed: int) -> Frame:
-    """One sample a pixel of a leaning wall: noise as of a lucky path, of mean 1."""
-    generator = torch.Generator().manual_seed(seed * 100_003 + number)
-    noise = -torch.log(torch.rand(1, 3, height, width, generator=generator).clamp_min(1e-6))
+    """One sample a pixel of a leaning wall."""
+    noise = exponential(1, 3, height, width, seed=seed * 100_003 + number)
     wall = leaning_wall(number, width, height)
     # The camera has a file of its own.
     del wall["view_projection"]

@@ -4,6 +4,7 @@ import itertools
 
 import torch
 import torch.nn.functional as F
+from planes import exponential
 from torch import Tensor
 
 from mcdenoise.denoiser import Denoiser
@@ -20,9 +21,7 @@ HEIGHT, WIDTH = 40, 50
 def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Frame:
     """A curved wall that stands still, lit by noise of mean 1."""
     rows, columns = torch.meshgrid(torch.arange(HEIGHT) / 20, torch.arange(WIDTH) / 20, indexing="ij")
-    if light is None:
-        generator = torch.Generator().manual_seed(seed)
-        light = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=generator).clamp_min(1e-6))
+    light = exponential(1, 3, HEIGHT, WIDTH, seed=seed) if light is None else light
     normal = F.normalize(torch.stack([(3 * rows).sin(), (2 * columns).cos(), torch.ones_like(rows)]), dim=0)
     position = torch.stack([columns, rows, 3 + columns.sin()])
     return Frame(

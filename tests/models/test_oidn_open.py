@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from refusals import refused
-from torch import Tensor
 from toys import frame_of, has_oidn
 
 from mcdenoise import Denoiser, Frame
@@ -99,46 +98,6 @@ def test_tiles_are_the_whole_image() -> None:
     frame = frame_of(200, 330)
     torch.testing.assert_close(tiles(frame), whole(frame), rtol=1e-4, atol=1e-5)
     assert tiles.report.tiles.startswith("6 x 4 tiles")
-
-
-def written_out(unet: OidnUNet, x: Tensor) -> Tensor:
-    """The base network layer by layer, as the library names them."""
-
-    def conv(layer: torch.nn.Conv2d, x: Tensor) -> Tensor:
-        padded = torch.nn.functional.pad(x, (1, 1, 1, 1))
-        patches = padded.unfold(2, 3, 1).unfold(3, 3, 1)
-        return torch.einsum("bihwkl,oikl->bohw", patches, layer.weight) + layer.bias.reshape(1, -1, 1, 1)  # type: ignore
-
-    def pool(x: Tensor) -> Tensor:
-        return x.unflatten(2, (-1, 2)).unflatten(4, (-1, 2)).amax((3, 5))
-
-    def up(x: Tensor) -> Tensor:
-        return x.repeat_interleave(2, 2).repeat_interleave(2, 3)
-
-    c0, c1, c2, c3, c4, c5a, c5b, d4a, d4b, d3a, d3b, d2a, d2b, d1a, d1b, d0 = unet.convolutions
-    pooled = [x]
-    features = pool(conv(c1, conv(c0, x).relu()).relu())
-    pooled.append(features)
-    for layer in (c2, c3):
-        features = pool(conv(layer, features).relu())
-        pooled.append(features)
-    features = pool(conv(c4, features).relu())
-    features = conv(c5b, conv(c5a, features).relu()).relu()
-    for (a, b), skip in zip(((d4a, d4b), (d3a, d3b), (d2a, d2b), (d1a, d1b)), reversed(pooled), strict=True):
-        features = conv(b, conv(a, torch.cat([up(features), skip], 1)).relu()).relu()
-    return conv(d0, features)
-
-
-@pytest.mark.parametrize("size", ["small", "base"])
-def test_layers_written_out_in_float64(size: Any) -> None:
-    torch.manual_seed(0)
-    unet = OidnUNet(9, size).double()
-    x = torch.rand(1, 9, 32, 48, dtype=torch.float64)
-    torch.testing.assert_close(unet(x), written_out(unet, x), rtol=1e-10, atol=1e-12)
-    # An image of another size is that one with zeros below and beside it.
-    smaller = x[..., :30, :37]
-    padded = torch.nn.functional.pad(smaller, (0, 11, 0, 2))
-    torch.testing.assert_close(unet(smaller), written_out(unet, padded)[..., :30, :37], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", ["small", "base", "large"])

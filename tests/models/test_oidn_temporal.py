@@ -23,11 +23,10 @@ from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import mixed
 from mcdenoise.models.recurrent import PREVIOUS, PREVIOUS_LIGHT, PREVIOUS_WEIGHT
 from mcdenoise.models.steadied import Steadied
-from mcdenoise.models.tiled import MIRRORED
+from mcdenoise.models.tiled import with_border, without_border
 from mcdenoise.models.with_oidn import CENTRED, NOISY, OIDN, OIDN_ALBEDO, OIDN_CLEAN, WithOidn, _without_pattern
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._steps.transfer import compress
-from mcdenoise.ops._window import mirrored
 from mcdenoise.train.clips import LIGHT
 from mcdenoise.train.front import split
 
@@ -37,28 +36,18 @@ if importlib.util.find_spec("pyoidn") is None:
 NAME = "oidn_temporal"
 
 
-def given(height: int = 21, width: int = 34, weight: float = 1.0) -> Frame:
+def given(height: int, width: int) -> Frame:
     """Return the frame that the last step sees: it has four images, all different."""
     extra = {name: torch.rand(1, 3, height, width) + 0.1 for name in (NOISY, PREVIOUS, PREVIOUS_LIGHT)}
-    extra[PREVIOUS_WEIGHT] = torch.full((1, 1, height, width), weight)
+    extra[PREVIOUS_WEIGHT] = torch.ones(1, 1, height, width)
     return frame_of(height, width, extra=extra)
-
-
-def bordered(frame: Frame) -> Frame:
-    """The frame with the mirror image around it that the networks see."""
-    border = MIRRORED, MIRRORED
-    return frame.map(lambda image: image if image.dim() == 3 else mirrored(image, border, border))
-
-
-def inside(image: Tensor) -> Tensor:
-    return image[..., MIRRORED:-MIRRORED, MIRRORED:-MIRRORED]
 
 
 def test_a_still_is_a_mean_of_two_images() -> None:
     model, oidn = create_model(NAME, threads=1), Oidn("high", threads=1)
     frame = frame_of(24, 40)
-    noisy = inside(oidn.denoised(bordered(frame), "noisy"))
-    clean = inside(oidn.denoised(oidn.with_clean_features(bordered(frame), "high"), "clean"))
+    noisy = without_border(oidn.denoised(frame.map(with_border), "noisy"))
+    clean = without_border(oidn.denoised(oidn.with_clean_features(frame.map(with_border), "high"), "clean"))
     output, _ = model(frame)
     torch.testing.assert_close(output.image, (noisy + 3 * clean) / 4)
     torch.testing.assert_close(output.stages["oidn"], noisy)
@@ -88,7 +77,7 @@ def test_noise_that_neighbours_share_is_removed() -> None:
     frame = Frame(color, albedo=albedo, normal=torch.tensor([0.0, 0, 1]).reshape(1, 3, 1, 1).expand(1, 3, 151, 201))
     stages, oidn = create_model(NAME, threads=1)(frame)[0].stages, Oidn("high", threads=1)
     assert stages["oidn"].shape == color.shape
-    whole = inside(oidn.denoised(bordered(frame), "noisy"))
+    whole = without_border(oidn.denoised(frame.map(with_border), "noisy"))
     assert smape_linear(stages["oidn"], truth) < smape_linear(whole, truth) / 2
 
 
@@ -98,7 +87,7 @@ def test_the_image_for_noisy_features_alone(quality: str) -> None:
     oidn = Oidn(quality, threads=1)
     frame = frame_of(24, 40)
     output, state = model(frame)
-    assert torch.equal(output.image, inside(oidn.denoised(bordered(frame), "noisy")))
+    assert torch.equal(output.image, without_border(oidn.denoised(frame.map(with_border), "noisy")))
     assert "oidn" in output.stages
     assert "oidn_clean" not in output.stages
     assert state is not None
@@ -280,5 +269,5 @@ def test_the_quality_of_the_filters_of_features(engine: str) -> None:
     for quality in ("fast", "high"):
         image = create_model("oidn_temporal", prefilter=quality, engine=engine)(frame)[0].stages[OIDN_CLEAN]
         oidn = Oidn("high", threads=1)
-        expected = inside(oidn.denoised(oidn.with_clean_features(bordered(frame), quality), "clean"))
+        expected = without_border(oidn.denoised(oidn.with_clean_features(frame.map(with_border), quality), "clean"))
         torch.testing.assert_close(image, expected, rtol=2e-3, atol=2e-4)

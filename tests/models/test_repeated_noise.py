@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from planes import exponential
 
 from mcdenoise import Denoiser, Frame
 
@@ -21,8 +22,7 @@ def shot(frames: int, seeds: int = 1, noise: float = 1.0, **changes: Any) -> tup
     given = {"albedo": albedo, "normal": normal, "depth": depth, "motion": motion, **changes}
     found = []
     for number in range(frames):
-        generator = torch.Generator().manual_seed(number % seeds if seeds > 1 else 0)
-        draws = -torch.log(torch.rand(1, 1, *SIZE, generator=generator).clamp_min(1e-6))
+        draws = exponential(1, 1, *SIZE, seed=number % seeds)
         found.append(Frame(clean * (1 - noise + noise * draws), **given))
     return found, clean
 

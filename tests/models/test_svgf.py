@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from planes import exponential
 from torch import Tensor
 
 from mcdenoise import ops
@@ -18,9 +19,7 @@ HEIGHT, WIDTH = 24, 40
 
 def frame(light: Tensor | None = None, seed: int = 0, **changes: Tensor) -> Frame:
     """A still corner of two walls, lit by noise of mean 1."""
-    generator = torch.Generator().manual_seed(seed)
-    if light is None:
-        light = -torch.log(torch.rand(1, 3, HEIGHT, WIDTH, generator=generator).clamp_min(1e-6))
+    light = exponential(1, 3, HEIGHT, WIDTH, seed=seed) if light is None else light
     right = (torch.arange(light.shape[-1]) >= light.shape[-1] // 2).expand(1, 1, *light.shape[-2:])
     normal = torch.cat([right, torch.zeros_like(right), ~right], 1).to(light.dtype)
     buffers = {
@@ -119,14 +118,6 @@ def test_layers_of_even_light_are_filtered(name: str, backend: Backend) -> None:
             part = torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
             layer = denoiser.output(given.replace(layers={"part": 0.1 * part})).layers["part"]
     assert layer.var() < 1e-3 * (0.1 * part).var()
-
-
-def test_a_frame_without_motion_has_no_history() -> None:
-    denoiser = Denoiser("svgf")
-    for seed in (0, 1):
-        given = frame(seed=seed).replace(motion=None)
-        torch.testing.assert_close(denoiser(given), Denoiser("svgf")(given))
-    assert denoiser.report.reset == "no motion, and no position with a previous camera"
 
 
 @pytest.mark.parametrize("sigma_n", [1.0, 1.5, 128.0])

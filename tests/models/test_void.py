@@ -187,6 +187,14 @@ def test_a_glow_keeps_its_light_and_a_masked_pixel_its_alpha() -> None:
     assert torch.equal(output.image[(mask == 0).expand_as(color)], color[(mask == 0).expand_as(color)])
 
 
+def test_an_albedo_is_divided_by_alpha_as_the_light_is() -> None:
+    alpha = covers("glass")
+    image = (0.6 * alpha).expand(-1, 3, -1, -1)
+    frame, _ = without_void(Frame(image, albedo=image, alpha=alpha, hints=Hints(alpha=True)))
+    torch.testing.assert_close(frame.albedo, frame.color)
+    torch.testing.assert_close(frame.albedo[..., 24, 32], torch.full((1, 3), 0.6))
+
+
 def test_the_mask_of_an_array_is_the_buffer() -> None:
     color, valid = (each[0].numpy().transpose(1, 2, 0) for each in charts(void=float("nan")))
     masked = np.ma.masked_invalid(color)

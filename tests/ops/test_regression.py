@@ -8,9 +8,9 @@ from torch import Tensor
 from mcdenoise.ops import block_regression
 
 
-def scene(height: int = 40, width: int = 50) -> Tensor:
+def scene() -> Tensor:
     """Normals of a curved wall, and positions on it, far from the origin."""
-    rows, columns = torch.meshgrid(torch.arange(height) / 20.0, torch.arange(width) / 20.0, indexing="ij")
+    rows, columns = torch.meshgrid(torch.arange(40) / 20.0, torch.arange(50) / 20.0, indexing="ij")
     depth = 1000 + (0.7 * columns).sin() + 0.2 * rows.square()
     normal = F.normalize(torch.stack([(3 * rows).sin(), (2 * columns).cos(), torch.ones_like(rows)]), dim=0)
     return torch.cat([normal, torch.stack([100 + columns, rows - 50, depth])])[None].double()

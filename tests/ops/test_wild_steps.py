@@ -36,8 +36,8 @@ Call = tuple[Callable[..., Any], list[Any]]
 def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tensor], Tensor] = as_it_is) -> list[Call]:
     batch, height, width = size
 
-    def some(seed: int, channels: int, like: torch.dtype = dtype) -> Tensor:
-        return layout(draw(seed, batch, channels, height, width, like))
+    def some(seed: int, channels: int) -> Tensor:
+        return layout(draw(seed, batch, channels, height, width, dtype))
 
     exposure = 0.7 * (1 + torch.arange(1, batch + 1, dtype=dtype).reshape(-1, 1, 1, 1))
     # Some pixels have no history, and some features are out of their range.

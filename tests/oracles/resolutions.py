@@ -5,7 +5,7 @@ import math
 
 from torch import Tensor
 
-from oracles.loops import Image, clamped, indices, softmax_of, tensor_of, zeros
+from oracles.loops import clamped, indices, softmax_of, tensor_of, zeros
 
 
 def downsample(image: Tensor) -> Tensor:
@@ -79,28 +79,20 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
 
 def demodulate(color: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     """``color / max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
-    source, modulation = color.tolist(), _modulation(albedo, floor)
-    out = zeros(color.shape)
-    for b, c, y, x in indices(color.shape):
-        out[b][c][y][x] = source[b][c][y][x] / modulation[b][c][y][x]
-    return tensor_of(out, color.shape)
+    return color.double() / _modulation(albedo, floor)
 
 
 def remodulate(image: Tensor, albedo: Tensor, *, floor: float = 4e-2) -> Tensor:
     """``image * max(albedo, floor)``; unchanged where the albedo is below 1e-4 in every channel."""
-    source, modulation = image.tolist(), _modulation(albedo, floor)
-    out = zeros(image.shape)
-    for b, c, y, x in indices(image.shape):
-        out[b][c][y][x] = source[b][c][y][x] * modulation[b][c][y][x]
-    return tensor_of(out, image.shape)
+    return image.double() * _modulation(albedo, floor)
 
 
-def _modulation(albedo: Tensor, floor: float) -> Image:
+def _modulation(albedo: Tensor, floor: float) -> Tensor:
     values, out = albedo.tolist(), zeros(albedo.shape)
     for b, c, y, x in indices(albedo.shape):
         textured = any(channel[y][x] >= 1e-4 for channel in values[b])
         out[b][c][y][x] = max(values[b][c][y][x], floor) if textured else 1.0
-    return out
+    return tensor_of(out, albedo.shape)
 
 
 def grid_splat(image: Tensor, guide: Tensor, *, cell: int = 8, bins: int = 32) -> tuple[Tensor, Tensor]:

@@ -30,14 +30,14 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
-def open_page(browser: Any, page: Path, complaints: list[str], layout: str = "seam", **options: Any) -> Any:
+def open_page(browser: Any, page: Path, complaints: list[str], **options: Any) -> Any:
     tab = browser.new_page(**{"viewport": {"width": 1200, "height": 900}, **options})
     tab.on("console", lambda message: complaints.append(f"{message.type}: {message.text}"))
     tab.on("pageerror", lambda error: complaints.append(str(error)))
     tab.on("request", lambda request: request.url.startswith(("file:", "data:")) or complaints.append(request.url))
     tab.goto(page.as_uri())
     ready(tab)
-    tab.check(f"input[value={layout}]", force=True)
+    tab.check("input[value=seam]", force=True)
     tab.fill("#frame", "0")
     tab.fill("#exposure", "0")
     ready(tab)

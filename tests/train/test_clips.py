@@ -26,10 +26,10 @@ def clip_of(stack: Tensor) -> Clip:
     return Clip(dict(zip(PARTS, stack.split(list(PARTS.values()), 2), strict=True)))
 
 
-def numbered(length: int = 3, height: int = 6, width: int = 7) -> Tensor:
+def numbered(length: int = 3) -> Tensor:
     """A shot in which every value is another whole number: channel, frame, row and column can be read off."""
-    count = length * sum(PARTS.values()) * height * width
-    return torch.arange(1.0, count + 1).reshape(length, -1, height, width)
+    count = length * sum(PARTS.values()) * 6 * 7
+    return torch.arange(1.0, count + 1).reshape(length, -1, 6, 7)
 
 
 def orbit(clip: Tensor) -> list[Tensor]:

@@ -19,27 +19,16 @@ EYE, TARGET, UP = np.array([1.5, -6.0, 2.5]), np.array([0.2, 0.5, 0.8]), np.arra
 TANGENT = 0.6
 
 
-def axes(eye: Array, target: Array, up: Array) -> Array:
-    """Rows: right, down, forward."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-    return np.stack([right, np.cross(forward, right), forward])
+FORWARD = (TARGET - EYE) / np.linalg.norm(TARGET - EYE)
+RIGHT = np.cross(FORWARD, UP) / np.linalg.norm(np.cross(FORWARD, UP))
+DOWN = np.cross(FORWARD, RIGHT)
+# The centres of pixels, from -1 to 1.
+SCREEN = (np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1) + 0.5) / (WIDTH, HEIGHT) * 2 - 1
 
 
-def matrix(eye: Array = EYE, target: Array = TARGET, up: Array = UP, tangent: float = TANGENT) -> Array:
-    """The row-vector world-to-clip matrix, clip y down, clip w the distance along the axis; clip z is w."""
-    rows = axes(eye, target, up)
-    columns = np.stack([rows[0] / tangent, rows[1] / tangent * WIDTH / HEIGHT, rows[2], rows[2]], 1)
-    return np.concatenate([columns, -(eye @ columns)[None]])
-
-
-def rays(offset: Array | float = 0.0) -> Array:
-    """Directions of the centres of pixels, or of other points in them, with length 1 along the axis."""
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    at = np.stack([columns, rows], -1) + 0.5 + offset
-    screen = at / (WIDTH, HEIGHT) * 2 - 1
-    own = axes(EYE, TARGET, UP)
-    return own[2] + TANGENT * (screen[..., :1] * own[0] + HEIGHT / WIDTH * screen[..., 1:] * own[1])
+def rays() -> Array:
+    """Directions of the centres of pixels, with length 1 along the axis."""
+    return FORWARD + TANGENT * (SCREEN[..., :1] * RIGHT + HEIGHT / WIDTH * SCREEN[..., 1:] * DOWN)
 
 
 def room(directions: Array, origin: Array = EYE) -> Array:
@@ -61,26 +50,22 @@ ALL = np.ones((HEIGHT, WIDTH), bool)
 def test_the_camera_of_exact_positions() -> None:
     position = room(rays())
     found = fit_camera(position, ALL)
-    expected = matrix()
+    # Clip y is down, and z is w, the distance along the axis.
+    columns = np.stack([RIGHT / TANGENT, DOWN / TANGENT * WIDTH / HEIGHT, FORWARD, FORWARD], 1)
+    expected = np.concatenate([columns, -(EYE @ columns)[None]])
     np.testing.assert_allclose(found.matrix, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     np.testing.assert_allclose(found.eye, EYE, atol=1e-6)
     assert found.error < 1e-6
-    # Clip w is the depth along the axis.
-    depth = (position - EYE) @ axes(EYE, TARGET, UP)[2]
-    np.testing.assert_allclose(position @ found.matrix[:3, 3] + found.matrix[3, 3], depth, rtol=1e-6)
 
 
 def test_an_orthographic_camera() -> None:
-    own = axes(EYE, TARGET, UP)
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    screen = np.stack([(columns + 0.5) / WIDTH * 2 - 1, (rows + 0.5) / HEIGHT * 2 - 1], -1)
-    origin = EYE + 2 * screen[..., :1] * own[0] + 2 * HEIGHT / WIDTH * screen[..., 1:] * own[1]
-    position = room(np.broadcast_to(own[2], (HEIGHT, WIDTH, 3)), origin)
+    origin = EYE + 2 * SCREEN[..., :1] * RIGHT + 2 * HEIGHT / WIDTH * SCREEN[..., 1:] * DOWN
+    position = room(np.broadcast_to(FORWARD, (HEIGHT, WIDTH, 3)), origin)
     found = fit_camera(position, ALL)
     assert found.error < 1e-6
     # Without a perspective w is 1 everywhere.
     np.testing.assert_allclose(position @ found.matrix[:3, 3] + found.matrix[3, 3], 1, atol=1e-6)
-    expected = np.concatenate([own[0] / 2, [-(EYE @ own[0]) / 2]])
+    expected = np.concatenate([RIGHT / 2, [-(EYE @ RIGHT) / 2]])
     np.testing.assert_allclose(found.matrix[:, 0], expected, atol=1e-6)
 
 

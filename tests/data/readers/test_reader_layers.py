@@ -17,13 +17,13 @@ from mcdenoise.data.readers.layers import layers_of, recognise
 SIZE = (24, 32)
 
 
-def part(channels: str, name: str = "", integers: str = "") -> Part:
+def part(channels: str) -> Part:
     names = tuple(each.replace("~", " ") for each in channels.split())
-    return Part(name, Window(0, 0, *SIZE), Window(0, 0, *SIZE), names, frozenset(integers.split()))
+    return Part("", Window(0, 0, *SIZE), Window(0, 0, *SIZE), names, frozenset())
 
 
-def found(channels: str, label: str = "render") -> dict[str, str]:
-    layers = layers_of(0, label, [part(channels)])
+def found(channels: str) -> dict[str, str]:
+    layers = layers_of(0, "render", [part(channels)])
     return {str(layer): recognised[0] for layer in layers if (recognised := recognise(layer)) is not None}
 
 

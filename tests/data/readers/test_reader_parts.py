@@ -126,9 +126,9 @@ def test_a_frame_that_does_not_add_up_is_told_and_goes_without(tmp_path: Path) -
         assert sequence.frame(2).diffuse is None
 
 
-def shares(count: int, seed: int = 0) -> list[Any]:
+def shares(count: int) -> list[Any]:
     """Layers of noisy light with edges in different places."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     places = (random.random((count, 24, 32, 1)) < 0.7).repeat(2, 1).repeat(2, 2)
     return list((places * random.gamma(1, 1, (count, 48, 64, 3))).astype(np.float32))
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from commands import run
+from commands import succeeds
 from pictures import as_channels, save
 
 from mcdenoise.data import open_sequence, write_exr
@@ -84,8 +84,6 @@ def test_methods_of_samples_run_on_those_of_files(tmp_path: Path, model: str) ->
     samples = drawn()
     for number in (1, 2):
         save(tmp_path / "in" / f"shot_000{number}.exr", in_color(samples))
-    status, printed, _ = run("denoise", tmp_path / "in", "-o", tmp_path / "out", "--model", model)
-    assert status == 0
+    printed = succeeds("denoise", tmp_path / "in", "-o", tmp_path / "out", "--model", model)
     assert f"  samples: kept ({COUNT} of each pixel, and the history)\n" in printed
-    status, printed, _ = run("inspect", tmp_path / "in")
-    assert "samples: of use to anf, layered, nppd, sbmc\n" in printed
+    assert "samples: of use to anf, layered, nppd, sbmc\n" in succeeds("inspect", tmp_path / "in")

@@ -9,6 +9,7 @@ import pytest
 import torch
 from kornia.filters import gaussian_blur2d
 from pictures import as_channels, save
+from test_correlated_noise import light as sampled
 from test_correlated_noise import texture as checks
 
 from mcdenoise.data import open_sequence
@@ -24,17 +25,11 @@ def texture(kind: str) -> Image:
 
 
 def light(seed: int) -> Image:
-    """One sample a pixel of smooth light: most paths find nothing, few find a lamp, and those are bright."""
+    """One sample a pixel of smooth light, in which each check of the texture is lit or in shadow."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    smooth = 1 + 0.5 * np.sin(rows / 40) * np.cos(columns / 50)
-    random = np.random.default_rng(seed)
-    path = np.where(random.random((HEIGHT, WIDTH)) < 0.4, random.pareto(2.5, (HEIGHT, WIDTH)) * 2, 0.05)
-    # The noise of a path is nearly the same in all channels.
-    tint = 1 + 0.05 * random.standard_normal((HEIGHT, WIDTH, 3))
-    # Each check of the texture is in the light or in shadow.
-    shadow = random.choice([0.1, 1], (HEIGHT, WIDTH))[rows // 5 * 5, columns // 7 * 7]
-    lit = (smooth * path * shadow)[..., None].astype(np.float32)
-    return lit * tint.clip(0.5, 1.5).astype(np.float32) * (1, 0.9, 0.8)
+    shadow = np.random.default_rng(seed).choice([0.1, 1], (HEIGHT, WIDTH))[rows // 5 * 5, columns // 7 * 7]
+    noise = sampled(seed)[0, :, :HEIGHT, :WIDTH].permute(1, 2, 0).numpy()
+    return noise * shadow[..., None].astype(np.float32)
 
 
 def blurred(image: Image, sigma: float) -> Image:
