@@ -6,12 +6,14 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mcdenoise.data.camera_matrices import MATRICES, Array
 from mcdenoise.data.images import Image, Mask
 from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.diffuse_specular import SPECULAR_ALBEDO, Split
-from mcdenoise.data.readers.files import RenderedFiles, as_tensor, world_to_camera
+from mcdenoise.data.readers.files import RenderedFiles, world_to_camera
 from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import is_same
 from mcdenoise.data.readers.samples import SampleLayers, mean_is
@@ -88,11 +90,10 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
             "--input-linear if its numbers are linear"
         )
     albedo = np.clip(np.nan_to_num(images["albedo"]), 0, 1) if "albedo" in images else None
-    color = np.nan_to_num(images["color"][..., :3])
-    given = (albedo, np.nan_to_num(images["normal"]) if "normal" in images else None)
+    guides = [None if each is None else _view(each) for each in (albedo, images.get("normal"))]
     # Once a shot: to load the compiled form would take longer than plain torch does.
     with use("torch"):
-        spread = noise_is_spread(as_tensor(color), *(None if each is None else as_tensor(each) for each in given))
+        spread = noise_is_spread(_view(images["color"]), *guides)
     if spread:
         shot.warnings.append(
             "'color': neighbouring pixels share noise, since the film's filter counts each sample in several of them, "
@@ -175,6 +176,11 @@ def _ends_at_origin(shot: RenderedFiles) -> bool:
     known = shot.known(images)
     found = fit_camera(images["position"], known)
     return found is not None and _is_origin(found, images["position"], known)
+
+
+def _view(image: Image) -> Tensor:
+    """``(1, 3, H, W)`` of the first three channels of ``(H, W, C)``; copies would take more memory than a denoiser."""
+    return torch.from_numpy(image[..., :3]).permute(2, 0, 1)[None]
 
 
 def _motion(shot: RenderedFiles, first: Mapping[str, Image]) -> tuple[Convention, str]:
