@@ -121,7 +121,8 @@ class _BmfrFolder(RenderedFiles):
                 # Both must be zero: mirrors and glass have no albedo, but they have a normal.
                 nothing |= ((images["albedo"] == 0) & (images["normal"] == 0)).all(-1, keepdims=True)
             images["depth"] = np.where(nothing, np.float32(np.inf), images["depth"])
-        buffers: dict[str, Any] = {name: as_tensor(image) for name, image in images.items()}
+        # One after the other, so that a large frame is not held twice.
+        buffers: dict[str, Any] = {name: as_tensor(images.pop(name)) for name in [*images]}
         if matrix is not None:
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
         return Frame(**buffers)
