@@ -43,7 +43,7 @@ def test_memory_that_is_too_short_is_told_before_a_frame_is_read(
     assert list((tmp_path / "out").iterdir()) == []
 
 
-# Measured on one core: 3.77 GB of the first, 1.96 GB of the last with 0.05 GB less kept free.
+# Measured on one core: 3.27 GB of the first, 1.49 GB of the last.
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory as Linux tells it")
