@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -163,8 +163,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
     units = {each.words.rpartition(", ")[2] for each in candidates}
     if moving < _LEAST_MOVING and len(units) == 1:
         return given, False
-    sampled = [(now, before, motion[:: (step := grid_step(motion.shape)), ::step]) for now, before, motion in pairs]
-    best, errors, at_rest = _compare(sampled, candidates)
+    best, errors, at_rest = _compare([(now, before, on_grid(motion)) for now, before, motion in pairs], candidates)
     better = errors[best] < _BETTER * errors[given]
     # Hardly better than no motion: this is conclusive only if the usual convention is far worse.
     if errors[best] > at_rest or (errors[best] > _TELLING * at_rest and not better):
@@ -179,7 +178,7 @@ def match_motion(pairs: Sequence[Pair], given: Convention) -> tuple[Convention |
 def _compare(
     pairs: Sequence[Pair], candidates: Sequence[Convention]
 ) -> tuple[Convention, dict[Convention, float], float]:
-    """The best convention, the mean :func:`_mismatch` of each, and that of no motion; of motion in sampled pixels."""
+    """The best convention, the mean :func:`_mismatch` of each, and that of no motion; of motion :func:`on_grid`."""
     *errors, at_rest = (float(np.mean([_mismatch(*pair, each) for pair in pairs])) for each in (*candidates, _AT_REST))
     found = dict(zip(candidates, errors, strict=True))
     # Interpolation blurs by half a pixel: between two units that match about equally well, prefer the usual one.
@@ -199,10 +198,10 @@ def match_cameras(pairs: Sequence[tuple[Image, Array]], given: Convention) -> Co
     if not pairs:
         return None
     given, candidates = _candidates([motion for motion, _ in pairs], given)
-    sampled = [(motion[:: (step := grid_step(motion.shape)), ::step], seen) for motion, seen in pairs]
+    compared = [(on_grid(motion), seen) for motion, seen in pairs]
 
     def missed(convention: Convention) -> float:
-        away = [np.linalg.norm(convention.apply(motion) - seen, axis=-1) for motion, seen in sampled]
+        away = [np.linalg.norm(convention.apply(motion) - seen, axis=-1) for motion, seen in compared]
         return float(np.mean([np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 0 for each in away]))
 
     errors = {each: missed(each) for each in candidates}
@@ -225,10 +224,10 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
 
     Only pixels with a motion are compared, so that a background without one is no argument for rest. A pixel led
     outside the image counts twice its difference without motion. So a fast pan is judged fairly, but a motion that
-    leads every pixel outside is rejected. The motion is that of the pixels that :func:`grid_step` samples.
+    leads every pixel outside is rejected. The motion is that :func:`on_grid`.
     """
     height, width, _ = next(iter(now.values())).shape
-    step, moved = grid_step((height, width)), convention.apply(motion)
+    step, moved = _grid_step((height, width)), convention.apply(motion)
     rows, columns = np.mgrid[:height:step, :width:step]
     x = (columns + moved[..., 0] + 0.5) / width * 2 - 1
     y = (rows + moved[..., 1] + 0.5) / height * 2 - 1
@@ -239,15 +238,20 @@ def _mismatch(now: Mapping[str, Image], before: Mapping[str, Image], motion: Ima
     for name, image in now.items():
         source = torch.from_numpy(before[name]).permute(2, 0, 1)[None]
         found = F.grid_sample(source, grid, align_corners=False, padding_mode="border")[0].permute(1, 2, 0).numpy()
-        unmoved, wanted = before[name][::step, ::step], image[::step, ::step]
+        unmoved, wanted = on_grid(before[name]), on_grid(image)
         error, at_rest = (np.minimum(np.abs(each - wanted).mean(-1), 1) for each in (found, unmoved))
         total += float(np.where(inside, error, 2 * at_rest[known].mean())[known].mean()) if known.any() else 1.0
     return total
 
 
-def grid_step(size: Sequence[int]) -> int:
-    """Every so manyth row and column of an image has about as many pixels as are compared."""
-    return max(1, int(np.sqrt(size[0] * size[1] / _COMPARED)))
+def on_grid(image: Any) -> Any:
+    """The pixels of ``(H, W, ...)`` that are compared, a view: about 16 thousand, in every so manyth row and column."""
+    step = _grid_step(image.shape)
+    return image[::step, ::step]
+
+
+def _grid_step(size: Sequence[int], pixels: int = _COMPARED) -> int:
+    return max(1, int(np.sqrt(size[0] * size[1] / pixels)))
 
 
 def miss(matrix: Array, position: Image | Array, seen: Mask) -> float:
@@ -264,11 +268,11 @@ def motion_to(matrix: Array, position: Image | Array, seen: Mask) -> Array:
     """Pixels from each pixel to the projection of its point by a matrix as in :func:`miss`, or NaN.
 
     Returns:
-        ``(H', W', 2)`` of every row and column that :func:`grid_step` samples.
+        ``(H', W', 2)`` :func:`on_grid`.
     """
-    (height, width), step = seen.shape, grid_step(seen.shape)
+    (height, width), step = seen.shape, _grid_step(seen.shape)
     rows, columns = np.mgrid[:height:step, :width:step]
-    clip = np.where(seen[::step, ::step, None], position[::step, ::step], np.nan) @ matrix[:3] + matrix[3]
+    clip = np.where(on_grid(seen)[..., None], on_grid(position), np.nan) @ matrix[:3] + matrix[3]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = (clip[..., :2] / clip[..., 3:] + 1) / 2 * (width, height) - 0.5
     result: Array = pixels - np.stack([columns, rows], -1)
@@ -358,7 +362,7 @@ def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
             continue
         stored = _pixels(frame, name)
         if name == "motion":
-            stored = stored[:: (step := grid_step(frame.size)), ::step]
+            stored = on_grid(stored)
         else:
             assert before.camera is not None
             stored = motion_to(before.camera, stored, _hit(frame)).astype(np.float32)
@@ -406,7 +410,7 @@ def _hit(frame: Frame) -> Mask:
 def sampled(position: Image | Array, seen: Mask) -> tuple[Array, Array, Array]:
     """Points ``(N, 3)`` on a grid of pixels, their pixel coordinates, and the image's width and height."""
     height, width = position.shape[:2]
-    step = max(1, int(np.sqrt(height * width / _POINTS)))
+    step = _grid_step((height, width), _POINTS)
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     points = position[rows, columns].astype(np.float64)
     known = seen[rows, columns] & np.isfinite(points).all(-1) & (np.abs(points) < 1e9).all(-1)

@@ -22,7 +22,7 @@ from mcdenoise.data.exr import LARGEST_HALF, read_exr, write_exr
 from mcdenoise.data.files import listed, make_folder, write_text
 from mcdenoise.data.images import Image, Mask, read_image_header, read_picture
 from mcdenoise.data.readers.diffuse_specular import DIFFUSE, LIGHT_PARTS, SPECULAR
-from mcdenoise.data.readers.files import RenderedFiles, as_tensor
+from mcdenoise.data.readers.files import RenderedFiles, as_tensors
 from mcdenoise.data.readers.names import FileGroup, find_files
 from mcdenoise.data.readers.opening import open_files
 from mcdenoise.data.readers.samples import write_samples
@@ -121,8 +121,7 @@ class _BmfrFolder(RenderedFiles):
                 # Both must be zero: mirrors and glass have no albedo, but they have a normal.
                 nothing |= ((images["albedo"] == 0) & (images["normal"] == 0)).all(-1, keepdims=True)
             images["depth"] = np.where(nothing, np.float32(np.inf), images["depth"])
-        # One after the other, so that a large frame is not held twice.
-        buffers: dict[str, Any] = {name: as_tensor(images.pop(name)) for name in [*images]}
+        buffers = as_tensors(images)
         if matrix is not None:
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
         return Frame(**buffers)

@@ -293,11 +293,11 @@ class RenderedFiles(FrameSequence):
             seen = ~nothing_hit(images["depth"])
         if self.drops_positions or matrix is None:
             images.pop("position", None)
-        buffers: dict[str, Any] = {name: as_tensor(image) for name, image in images.items() if name in BUFFERS}
+        if seen is not None:
+            images["depth"] = np.where(seen, images["depth"], np.inf)
+        buffers = as_tensors(images)
         if matrix is not None and not self.drops_positions:
             buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
-        if seen is not None:
-            buffers["depth"] = as_tensor(np.where(seen, images["depth"], np.inf))
         # They are the ratio of light and alpha, which only both together can keep.
         hints = Hints(alpha=self.part_of(self.choice.layers["color"]).straight)
         return Frame(**buffers, layers={name: as_tensor(light) for name, light in lights.items()}, hints=hints)
@@ -415,6 +415,11 @@ def far_points(matrix: Array, depth: float, sky: Mask) -> Array:
     columns_used = matrix[:, [0, 1, 3]]
     result: Array = (SKY * depth * screen - columns_used[3]) @ np.linalg.pinv(columns_used[:3])
     return result
+
+
+def as_tensors(images: dict[str, Image]) -> dict[str, Any]:
+    """The buffers of a frame, taken out of a dictionary one after the other: a large frame is not held twice."""
+    return {name: as_tensor(images.pop(name)) for name in [*images] if name in BUFFERS}
 
 
 def as_tensor(image: Image) -> Tensor:
