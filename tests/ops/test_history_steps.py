@@ -1,5 +1,6 @@
 """The fast backend of a shot's history against the reference implementation."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from toys import Seen, Shot
 
 from mcdenoise.frame import Frame
+from mcdenoise.ops import Surface, use
 from mcdenoise.ops._history import COLOR, SQUARE, light_changes
 from mcdenoise.ops._numba import _runtime
 from mcdenoise.ops._steps import history as steps
@@ -113,6 +115,22 @@ def test_layout_in_memory_and_threads_change_nothing(
         torch.set_num_threads(count)
         for a, b in zip(passed(laid_out, "numba"), expected, strict=True):
             assert all(map(torch.equal, a[:3], b[:3]))
+
+
+def test_the_fraction_with_a_history_is_that_of_each_image() -> None:
+    first, second = WAYS["two images"][:2]
+    surfaces = [Surface(frame.position, frame.normal, frame.depth) for frame in (second, first)]
+    motion = torch.zeros_like(second.color[:, :2])
+    motion[1, ..., : SIZE[1] // 2] = torch.inf
+    found = []
+    for backend in ("torch", "numba"):
+        with use(backend):
+            before, entering = (steps.incoming(frame.color, 15.0, compared=False) for frame in (first, second))
+            history = steps.without_history(before), torch.ones_like(before[:, :1])
+            settings = {"albedo": second.albedo, "specular_length": 2, "lag_threshold": math.inf}
+            found.append(steps.blend(entering, *history, motion, *surfaces, alpha_min=0.1, **settings)[2])
+    torch.testing.assert_close(found[1], found[0], check_dtype=False)
+    assert found[0][1] < found[0][0] - 0.2
 
 
 @pytest.mark.parametrize("root", [0.9, 1.0, 1.02, 1.2, 3.0])
