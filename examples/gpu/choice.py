@@ -26,8 +26,9 @@ from mcdenoise.errors import run_script
 from mcdenoise.methods import parse_method
 from mcdenoise.models import create_model, describe_weights, save_weights
 from mcdenoise.models._weights import find_weights
-from mcdenoise.models.wild import _BLOCK, _PACE, Trust
+from mcdenoise.models.wild import _PACE, Trust
 from mcdenoise.nn.oidn import oidn_exposure
+from mcdenoise.ops._constants import BLOCK
 from mcdenoise.train.front import split
 
 LOGITS = (-40.0, 0.0, 40.0)  # of none, half, and all
@@ -51,7 +52,7 @@ def tried(model: nn.Module, trust: Trust, tiles: Tiles) -> tuple[Tensor, Tensor,
                 trust.last.bias.copy_(torch.tensor(logits) / _PACE)
                 image = model(frame)[0].image
                 error = (image - reference).abs() / (image.abs() + reference + 0.01 / scale)
-                errors.append(F.avg_pool2d(error.mean(1, keepdim=True), _BLOCK))
+                errors.append(F.avg_pool2d(error.mean(1, keepdim=True), BLOCK))
             # What it sees is the same each time; models see a border around the image.
             del seen[1 - len(errors) :]
             seen[-1] = _middle(seen[-1], errors[0].shape[-2:])

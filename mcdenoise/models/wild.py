@@ -27,12 +27,13 @@ from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.filtered import Features, Filtered
 from mcdenoise.models.skipping import TOLERANCE, Skipping
 from mcdenoise.models.tiled import Tiled
+from mcdenoise.nn._cpu import channels_last
 from mcdenoise.nn.oidn import OidnUNet, Size, oidn_exposure
-from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
-from mcdenoise.ops._constants import RECENT_ALPHA
-from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress
-from mcdenoise.ops._steps.wild import wild_choice, wild_input
-from mcdenoise.ops._window import block_means, corner, up_to_multiple
+from mcdenoise.ops import NO_ALBEDO, remodulate
+from mcdenoise.ops._constants import BLOCK
+from mcdenoise.ops._steps.transfer import compress
+from mcdenoise.ops._steps.wild import differences, wild_choice, wild_figures, wild_input
+from mcdenoise.ops._window import block_means, corner, parts_of
 from mcdenoise.ops.lag import THRESHOLD
 
 # The mean of frame and history, albedo, normal as the library sees them; the frame, the accumulated radiance; the part
@@ -42,8 +43,8 @@ _CHANNELS = 9 + 3 + 3 + 1
 _LOGITS = (0.0, -7.0, -7.0, -7.0)
 _LITTLE = -12.0  # that of the network's image, while its weights are random
 _PACE = 16.0  # factor of all logits, by which they learn faster than the layers that start with weights
-# The network for the weights of the history: side of the blocks that it sees, channels, and the initial logits.
-_BLOCK, _WIDTH, _TRUST = 4, 24, (1.5, 0.0)
+# The network for the weights of the history: channels, and the initial logits.
+_WIDTH, _TRUST = 24, (1.5, 0.0)
 _FIGURES = 20
 _LEAST = 3e-3  # smallest difference that matters, on the library's scale
 
@@ -60,7 +61,7 @@ class Trust(nn.Module):
     where the albedo changes.
     """
 
-    reach = (3 + 2 + 6) * _BLOCK
+    reach = (3 + 2 + 6) * BLOCK
 
     def __init__(self) -> None:
         super().__init__()
@@ -73,51 +74,21 @@ class Trust(nn.Module):
             self.last.weight.mul_(0.1 / _PACE)
             self.last.bias.copy_(torch.tensor(_TRUST) / _PACE)
 
-    def forward(
-        self,
-        alone: Tensor,
-        recent: Tensor,
-        color: Tensor,
-        part: Tensor,
-        albedo: Tensor | None,
-        normal: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """The weights ``(B, 1, H, W)`` of the accumulated radiance, and of the whole history in it.
+    def forward(self, figures: Tensor) -> Tensor:
+        """The logits ``(B, 2, H, W)`` of the weights of the accumulated radiance, and of the whole history in it.
 
         Args:
-            alone: ``(B, 3, H, W)`` radiance of the frame, times the exposure.
-            recent: ``(B, 3, H, W)`` likewise, of the recent history.
-            color: ``(B, 3, H, W)`` likewise, of the whole history.
-            part: ``(B, 1, H, W)`` part of the history in it.
-            albedo: ``(B, 3, H, W)`` of the frame; ``None`` counts as one.
-            normal: likewise; ``None`` counts as zero.
+            figures: ``(B, 19, H, W)`` of blocks, see :func:`mcdenoise.ops._steps.wild.wild_figures`.
         """
-        # In ONNX, bounds that are integers become tensors, which onnxscript loses if two steps clamp the same image.
-        albedo = torch.ones_like(alone) if albedo is None else albedo.to(alone.dtype).clamp(0.0, 1.0)
-        normal = torch.zeros_like(alone) if normal is None else normal.to(alone.dtype).clamp(-1.0, 1.0)
-        images = [image.clamp_max(MAX_RADIANCE) for image in (alone, recent, color)]
-        light = torch.cat([image.mean(1, keepdim=True) for image in images], 1)
-        shown = torch.cat([image.mean(1, keepdim=True) for image in (*map(compress, images), albedo)], 1)
-        each = torch.cat([shown, normal, _apart(shown), part, light], 1)
-        each = up_to_multiple(each, _BLOCK, "replicate")
-        means, apart, part, light = F.avg_pool2d(each, _BLOCK).split([7, 3, 1, 3], 1)
-        # Not mean squares less squared means: in half precision nothing is left of them where a block is even.
-        pixels = each[:, :7].unflatten(3, (-1, _BLOCK)).unflatten(2, (-1, _BLOCK))
-        squares = (pixels - means[:, :, :, None, :, None]).square().flatten(4).flatten(2, 3)
-        variances, of_normal = F.avg_pool2d(squares, _BLOCK).split([4, 3], 1)
-        means, normal = means.split([4, 3], 1)
-        of_normal = of_normal.sum(1, keepdim=True)
-        lengths = of_normal + normal.square().sum(1, keepdim=True)
+        means, normal, apart, part, light, variances = figures.split([4, 3, 3, 1, 3, 5], 1)
+        lengths = variances[:, 4:] + normal.square().sum(1, keepdim=True)
         # Means of radiance, which noise does not change.
-        far = _apart(compress(block_means(light, 4)))
+        far = differences(compress(block_means(light, 4)))
         far = corner(F.interpolate(far, scale_factor=4, mode="bilinear", align_corners=False), *part.shape[-2:])
-        variances = torch.cat([variances, of_normal], 1)
-        differences = torch.cat([apart, _apart(means), far, variances.clamp_min(_LEAST**2).sqrt()], 1)
-        seen = [means[:, :3], (differences + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
-        logits = _PACE * self.last(self.layers(torch.cat(seen, 1))).to(alone.dtype)
-        wide: Tensor = F.interpolate(logits, scale_factor=_BLOCK, mode="bilinear", align_corners=False).sigmoid()
-        trust, whole = corner(wide, *alone.shape[-2:]).split(1, 1)
-        return trust, whole
+        each = torch.cat([apart, differences(means), far, variances.clamp_min(_LEAST**2).sqrt()], 1)
+        seen = [means[:, :3], (each + _LEAST).log() / 2, part, (1.02 - part).log() / 2, lengths]
+        logits: Tensor = _PACE * self.last(self.layers(channels_last(torch.cat(seen, 1), figures.dtype)))
+        return logits.to(figures.dtype)
 
 
 class WildNetwork(nn.Module):
@@ -150,41 +121,26 @@ class WildNetwork(nn.Module):
 
     def statistics(self, frame: Frame) -> Mapping[str, Tensor]:
         """The exposure of the whole image."""
-        return {"oidn_exposure": oidn_exposure(_lit(frame, frame.color))}
+        color = frame.color if frame.albedo is None else remodulate(frame.color, frame.albedo)
+        return {"oidn_exposure": oidn_exposure(color)}
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        color, albedo = frame.color, frame.albedo
+        color, albedo, normal = frame.color, frame.albedo, frame.normal
         exposure = (frame.statistics or self.statistics(frame))["oidn_exposure"]
-        alone = color if frame.current is None else frame.current.to(color.dtype)
-        history, alone = _lit(frame, color), _lit(frame, alone)
-        mean, part = history, torch.zeros_like(color[:, :1])
-        if frame.length is not None:
-            recent = history if frame.recent is None else _lit(frame, frame.recent.to(color.dtype))
-            lengths = (frame.length.clamp_max(1 / RECENT_ALPHA), frame.length)
-            short, part = ((1 - 1 / length.clamp_min(1)).to(color.dtype) for length in lengths)
-            if (behind := background_of(frame)) is not None:
-                short, part = (torch.where(behind, 0, each) for each in (short, part))
-                recent, history = (torch.where(behind, alone, image) for image in (recent, history))
-            exposed = (image * exposure for image in (alone, recent, history))
-            trust, whole = self.trust(*exposed, part, albedo, frame.normal)
-            history, part = torch.lerp(recent, history, whole), torch.lerp(short, part, whole)
-            mean = torch.lerp(alone, history, trust)
-        seen, images = wild_input(mean, alone, history, albedo, frame.normal, part, exposure, self.needs.stride)
-        image, logits = corner(self.unet(seen), *frame.size).split([3, len(_LOGITS)], 1)
-        predicted = torch.cat([image, _PACE * logits], 1)
-        image = wild_choice(predicted, images, part, exposure, _LOGITS).to(color.dtype)
-        return answered(frame, image if albedo is None else demodulate(image, albedo)), None
-
-
-def _apart(images: Tensor) -> Tensor:
-    """How far frame, recent and whole history differ."""
-    alone, recent, color, *_ = images.split(1, 1)
-    return torch.cat([alone - color, recent - color, alone - recent], 1).abs()
-
-
-def _lit(frame: Frame, image: Tensor) -> Tensor:
-    return image if frame.albedo is None else remodulate(image, frame.albedo)
+        alone, recent = (color if image is None else image.to(color.dtype) for image in (frame.current, frame.recent))
+        buffers = (alone, recent, color, albedo, normal)
+        if frame.length is None:
+            length = color.new_ones(1, 1, 1, 1).expand_as(color[:, :1])
+            logits = color.new_zeros(len(color), 2, *(parts_of(side, BLOCK) for side in frame.size))
+        else:
+            behind, length = background_of(frame), frame.length.to(color.dtype)
+            length = length if behind is None else torch.where(behind, 1, length)
+            logits = self.trust(wild_figures(*buffers, length, exposure))
+        seen, images, part = wild_input(*buffers, length, logits, exposure, self.needs.stride)
+        predicted = corner(self.unet(seen), *frame.size)
+        image = wild_choice(predicted, images, part, albedo, exposure, _LOGITS, _PACE)
+        return answered(frame, image.to(color.dtype)), None
 
 
 def background_of(frame: Frame) -> Tensor | None:

@@ -116,6 +116,19 @@ def convolved_in_float32(x: Tensor, layer: nn.Conv2d) -> Tensor:
     return rough.to(torch.float32) + lost
 
 
+def halved(x: Tensor) -> Tensor:
+    """The largest of each 2x2 pixels of ``(B, C, 2 H, 2 W)``; as the larger of two, in half of the time."""
+    if not _is_fused(x, x.dtype):
+        return F.max_pool2d(x, 2)
+    rows = torch.maximum(x[..., ::2, :], x[..., 1::2, :])
+    return torch.maximum(rows[..., ::2], rows[..., 1::2])
+
+
+def channels_last(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """``x`` with the channels of a pixel side by side, as convolutions are fast; vmap has no such layout."""
+    return x.to(dtype, memory_format=torch.preserve_format if is_transformed() else torch.channels_last)
+
+
 def _without_autocast(device_type: str) -> AbstractContextManager[object]:
     """Compute in the precision of the operands; devices without values have no autocast to disable."""
     known = torch.amp.is_autocast_available(device_type)

@@ -10,12 +10,10 @@ import itertools
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock, UpConvBlock, convolved_in_float32
+from mcdenoise.nn._cpu import ConvBlock, UpConvBlock, channels_last, convolved_in_float32, halved
 from mcdenoise.nn.unet import Live
-from mcdenoise.ops._backend import is_transformed
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._window import computing_dtype, corner, parts_of, up_to_multiple
 
@@ -112,14 +110,12 @@ class OidnUNet(nn.Module):
         """
         height, width = x.shape[-2:]
         x = up_to_multiple(x, _MULTIPLE)
-        # Inside of vmap there is one axis more than this layout has.
-        layout = torch.preserve_format if is_transformed() else torch.channels_last
-        x = x.to(computing_dtype(x), memory_format=layout)
+        x = channels_last(x, computing_dtype(x))
         skips = [x]
         for level, block in enumerate(self.encoder):
             x = block(x)
             if level < _LEVELS - 1:
-                x = F.max_pool2d(x, 2)
+                x = halved(x)
                 skips.append(x)
         # The coarsest level is the result of the last pooling.
         skips.pop()

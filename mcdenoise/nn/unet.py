@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from mcdenoise.nn._cpu import ConvBlock
+from mcdenoise.nn._cpu import ConvBlock, halved
 from mcdenoise.ops._window import corner, parts_of, up_to_multiple
 
 # Peak numbers per pixel, measured: 4.5 widths inside the U-Net, and 54 for the surrounding images and features, which
@@ -92,7 +91,7 @@ class UNet(nn.Module):
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):
             if level:
-                x = F.max_pool2d(x, 2)
+                x = halved(x)
             x = block(x)
             skips.append(x)
         features = [skips.pop()]

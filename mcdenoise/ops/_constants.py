@@ -51,6 +51,9 @@ LEAST_CENTER, FARTHEST_FEATURE = 1e-6, 1e15
 # sqrt(x^2 + TENT_ROUNDING) for |x|, which has a derivative at 0.
 GUIDE_STEPS, TENT_ROUNDING = 256, 1e-8
 
+# Side of the blocks of pixels for which `wild` weighs its history.
+BLOCK = 4
+
 # Open Image Denoise's perceptually uniform scale: `a y` in the dark, `b y^c + d` in the middle, `e log(y + f) + g` for
 # bright radiance. The joints are radiance (y0, y1), and places on the scale (x0, x1) before it is divided by its value
 # at the largest half-precision number, to which brighter radiance is clamped.

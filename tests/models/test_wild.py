@@ -14,6 +14,7 @@ from mcdenoise.models.wild import _LOGITS, _PACE, Trust, WildNetwork
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.ops._steps.transfer import compress, expand
+from mcdenoise.ops._steps.wild import wild_figures
 
 SIZE = (32, 64)
 
@@ -23,6 +24,8 @@ def given(length: float) -> Frame:
     frame = frame_of(*SIZE).to(torch.float64)
     alone, recent = torch.rand(2, 1, 3, *SIZE, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     length_of_all = torch.full((1, 1, *SIZE), length, dtype=torch.float64)
+    if length == 1:
+        alone = recent = frame.color
     return frame.replace(current=alone, recent=recent, length=length_of_all)
 
 
@@ -67,15 +70,16 @@ def test_the_weights_of_the_history_tell_late_light_from_noise(which: int) -> No
     """The figures, not the weights, which are random: noise of single pixels, or another mean of the whole block."""
     torch.manual_seed(0)
     trust, flat = Trust().double(), torch.full((1, 3, *SIZE), 0.5, dtype=torch.float64)
-    part, noise = torch.full_like(flat[:, :1], 0.9), 0.1 * torch.ones_like(flat)
+    length, noise = torch.full_like(flat[:, :1], 10), 0.1 * torch.ones_like(flat)
     noise[..., ::2] *= -1
 
     def weight(image: torch.Tensor) -> torch.Tensor:
         images = [flat, flat, flat]
         images[which] = image
-        return torch.cat(trust(*images, part, None, None), 1)
+        logits: torch.Tensor = trust(wild_figures(*images, None, None, length, torch.ones_like(flat[..., :1, :1])))
+        return logits
 
-    assert weight(flat).shape == (1, 2, *SIZE)
+    assert weight(flat).shape == (1, 2, SIZE[0] // 4, SIZE[1] // 4)
     torch.testing.assert_close(weight(flat + noise), weight(flat - noise))
     assert not torch.allclose(weight(flat + noise), weight(flat + 0.1))
 

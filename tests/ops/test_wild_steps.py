@@ -40,24 +40,33 @@ def calls(size: tuple[int, int, int], dtype: torch.dtype, layout: Callable[[Tens
         return layout(draw(seed, batch, channels, height, width, dtype))
 
     exposure = 0.7 * (1 + torch.arange(1, batch + 1, dtype=dtype).reshape(-1, 1, 1, 1))
-    # Some pixels have no history, and some features are out of their range.
-    seen, part = [some(5, 3), some(6, 3)], some(23, 1).clamp(0, 1)
+    # Some pixels have no history, or no albedo, and some features are out of their range.
+    seen, part, length = [some(5, 3), some(6, 3)], some(23, 1).clamp(0, 1), 2 + 3 * some(24, 1)
     radiance = [layout(draw(seed, batch, 3, height, width, dtype).exp()) for seed in (3, 19, 20)]
+    logits = layout(draw(25, batch, 2, -(-height // 4), -(-width // 4), dtype))
     predicted, on_scale = (layout(draw(21, batch, count, height, width, dtype).tanh()) for count in (7, 9))
     calls: list[Call] = [
         # From the dark, where the scale is linear, to the largest radiance and beyond.
         (transfer.compress, [layout((6 * draw(15, batch, 3, height, width, dtype)).exp())]),
         (transfer.expand, [layout(draw(16, batch, 3, height, width, dtype).sigmoid())]),
-        (wild.wild_input, [*radiance, *seen, part, exposure, 4]),
-        (wild.wild_input, [*radiance, None, None, part, exposure, 1]),
-        (wild.wild_choice, [predicted, on_scale, part, exposure, (0.0, -2.0, -1.0, 0.5)]),
+        (wild.wild_figures, [*radiance, *seen, length, exposure]),
+        (wild.wild_figures, [*radiance, None, None, length, exposure]),
+        (wild.wild_input, [*radiance, *seen, length, logits, exposure, 4]),
+        (wild.wild_input, [*radiance, None, None, length, logits, exposure, 1]),
+        (wild.wild_choice, [predicted, on_scale, part, seen[0], exposure, (0.0, -2.0, -1.0, 0.5), 3.0]),
+        (wild.wild_choice, [predicted, on_scale, part, None, exposure, (0.0, -2.0, -1.0, 0.5), 3.0]),
     ]
     return calls
 
 
 def results(call: Call, backend: str) -> list[Tensor]:
     function, arguments = call
-    return list(as_tuple(by(backend, function)(*arguments)))
+    found = list(as_tuple(by(backend, function)(*arguments)))
+    if function is wild.wild_figures:
+        # Radiance is larger than the rest.
+        means, radiance, variances = found[0].split([11, 3, 5], 1)
+        found = [torch.cat([means, variances], 1), radiance]
+    return found
 
 
 def assert_same(actual: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
