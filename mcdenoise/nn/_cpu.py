@@ -100,20 +100,23 @@ def _convolved(
     return onto
 
 
-def convolved_in_float32(x: Tensor, layer: nn.Conv2d) -> Tensor:
+def convolved_in_float32(x: Tensor, layer: nn.Conv2d, near: Tensor) -> Tensor:
     """A convolution, with a border of one pixel, of features that may be bfloat16, with a float32 result.
 
-    oneDNN convolves bfloat16 with sums in float32, and rounds these at last. If no derivative is requested, what this
-    rounding has lost is computed by a second convolution, which begins with the negative of the first one's result.
-    Weights and bias are rounded to bfloat16, as those of all other layers.
+    oneDNN convolves bfloat16 with sums in float32, and rounds these at last. If no derivative is requested, what it
+    rounds is the difference from an image that the result resembles, so that hardly anything is lost. Weights and bias
+    are rounded to bfloat16, as those of all other layers.
+
+    Args:
+        x: ``(B, C, H, W)``.
+        layer: a convolution of 3x3 pixels to N channels.
+        near: ``(B, N, H, W)`` in the same dtype, what the result resembles.
     """
-    dtype = x.dtype
-    if dtype != torch.bfloat16 or not _is_fused(x, dtype):
+    if x.dtype != torch.bfloat16 or not _is_fused(x, x.dtype):
         with _without_autocast(x.device.type):
             return cast(Tensor, layer(x.to(layer.weight.dtype)))
-    rough = _convolved(x, layer.weight, layer.bias, dtype)
-    lost = _convolved(x, layer.weight, layer.bias, dtype, onto=-rough)
-    return rough.to(torch.float32) + lost
+    near = near.contiguous(memory_format=torch.channels_last)
+    return _convolved(x, layer.weight, layer.bias, x.dtype, onto=-near).to(torch.float32).add_(near)
 
 
 def halved(x: Tensor) -> Tensor:

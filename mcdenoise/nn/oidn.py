@@ -111,7 +111,8 @@ class OidnUNet(nn.Module):
         height, width = x.shape[-2:]
         x = up_to_multiple(x, _MULTIPLE)
         x = channels_last(x, computing_dtype(x))
-        skips = [x]
+        # The first channels are those of the image; what follows is of the same size as the other results.
+        near, skips = x[:, : self.last.out_channels], [x]
         for level, block in enumerate(self.encoder):
             x = block(x)
             if level < _LEVELS - 1:
@@ -121,7 +122,7 @@ class OidnUNet(nn.Module):
         skips.pop()
         for block in self.decoder:
             x = block(x, skips.pop())
-        return corner(convolved_in_float32(x, self.last), height, width)
+        return corner(convolved_in_float32(x, self.last, near), height, width)
 
 
 class FeatureFilter(nn.Module):
