@@ -22,7 +22,7 @@ docs: $(VENV)/.stamp-fast,oidn,docs ## build the documentation as a site that op
 	@echo "build/site/index.html"
 
 figures: $(VENV)/.stamp-fast,render,peers,report ## measure anew what the documentation says of error and run time; takes two hours
-	$(BIN)/mcdenoise generate --takes --unseen --seeds 900112-900127,900140-900155,900170-900189,900200-900239 -o build/figures/takes
+	$(BIN)/mcdenoise generate --takes --unseen --seeds 900140-900155,900170-900189,900200-900259 -o build/figures/takes
 	$(BIN)/mcdenoise generate --takes --unseen --plain --frames 32 --seeds 900132-900139,900160-900167 -o build/figures/long
 	for takes in takes long; do rm -f benchmarks/$$takes.json && $(BIN)/python examples/takes.py build/figures/$$takes \
 		--clean build/figures/clean-$$takes --json benchmarks/$$takes.json || exit; done

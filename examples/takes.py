@@ -25,7 +25,7 @@ from mcdenoise.data.shards import find_shards, open_shard
 from mcdenoise.errors import run_script
 from mcdenoise.frame import Frame
 from mcdenoise.methods import parse_method
-from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_smape_linear
+from mcdenoise.metrics import psnr_srgb, smape_linear, temporal_rmse_srgb, temporal_smape_linear
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.train import clean_references
 from mcdenoise.train.footage import frame_of
@@ -57,7 +57,8 @@ def errors(denoiser: Denoiser, frames: Sequence[Frame], reference: Tensor) -> di
     found = {"smape": smape_linear(image, reference).mean(), "psnr": psnr_srgb(image, reference).mean()}
     found["light"] = image.mean() / reference.mean()
     if len(reference) > 1:
-        found["tsmape"] = temporal_smape_linear(image[None], reference[None]).mean()
+        clips = image[None], reference[None]
+        found |= {"tsmape": temporal_smape_linear(*clips).mean(), "trmse": temporal_rmse_srgb(*clips).mean()}
     return {name: round(value.item(), 5) for name, value in found.items()}
 
 
@@ -82,7 +83,8 @@ def table(rows: Rows, models: list[str], moving: bool) -> Iterable[str]:
     kept = rows_of(rows, moving=moving)
     if not kept:
         return
-    columns = ["SMAPE over OIDN's", "worst", "PSNR beside OIDN's", "light", "tSMAPE over OIDN's"][: 5 if moving else 4]
+    columns = ["SMAPE over OIDN's", "worst", "PSNR beside OIDN's", "light"]
+    columns += ["tSMAPE over OIDN's", "tRMSE over OIDN's"] if moving else []
     yield " | ".join([f"| {len(kept)} {'shots' if moving else 'stills'}", *columns]) + " |"
     yield "|---" + "|--:" * len(columns) + "|"
     for name in models:
@@ -90,7 +92,8 @@ def table(rows: Rows, models: list[str], moving: bool) -> Iterable[str]:
         ahead = [row[name]["psnr"] - max(row[each]["psnr"] for each in OIDN) for row in kept]
         light = sum(row[name]["light"] for row in kept) / len(kept)
         cells = [f"{mean(found):.3f}", f"{max(found):.3f}", f"{sum(ahead) / len(ahead):+.2f} dB", f"{light:.3f}"]
-        cells += [f"{mean(ratios(rows, name, 'tsmape', moving=True)):.3f}"] if moving else []
+        temporal = ("tsmape", "trmse") if moving else ()
+        cells += [f"{mean(ratios(rows, name, key, moving=True)):.3f}" for key in temporal]
         yield " | ".join([f"| {name}", *cells]) + " |"
 
 
