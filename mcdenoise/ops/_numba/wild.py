@@ -34,7 +34,8 @@ def wild_figures(
     figures = torch.empty((len(alone), _FIGURES, *size), dtype=alone.dtype, device="cpu")
     if figures.numel():
         arguments = (figures.numpy(), *map(source, buffers), *alone.shape[2:])
-        share_rows(figures, lambda *rows: _figure_rows(*arguments, *rows))
+        # An image of as many rows as there are rows of blocks.
+        share_rows(alone[..., : figures.shape[2], :], lambda *rows: _figure_rows(*arguments, *rows))
     return figures
 
 
@@ -89,8 +90,7 @@ def wild_choice(
 
 def _features(image: Tensor, albedo: Tensor | None, normal: Tensor | None) -> tuple[Tensor, Tensor]:
     """Albedo and normal, or in the place of one a single number that is read for every pixel."""
-    missing = (image.new_full((1, 1, 1, 1), value).expand_as(image) for value in (1, 0))
-    one, zero = missing
+    one, zero = (image.new_full((1, 1, 1, 1), value).expand_as(image) for value in (1, 0))
     return one if albedo is None else albedo, zero if normal is None else normal
 
 
@@ -117,65 +117,83 @@ def _figure_rows(
     first: int,
     last: int,
 ) -> None:
-    _, _, _, blocks = out.shape
-    number = out.dtype.type
-    zero, one, third = number(0), number(1), number(1 / 3)
-    most, share = number(MAX_RADIANCE), number(1 / BLOCK**2)
-    factor = exposure[0][b * exposure[1][0]]
     # The 14 images of which blocks have means: 4 on the scale, normal, 3 differences, part, and 3 of radiance.
-    rows, lit = np.zeros((14, BLOCK, blocks * BLOCK), out.dtype), np.empty((3, 3, width), out.dtype)
+    rows, lit = np.empty((14, BLOCK, out.shape[3] * BLOCK), out.dtype), np.empty((3, 3, width), out.dtype)
     scale, frames = np.empty((3, width), out.dtype), np.empty(width, out.dtype)
+    factor = exposure[0][b * exposure[1][0]]
     for block in range(first, last):
         for i in range(BLOCK):
             y = min(block * BLOCK + i, height - 1)
             read_row(frames, length, b, 0, y, 0)
-            for x in range(width):
-                rows[10, i, x] = one - one / max(frames[x], one)
-            rows[3, i], rows[11, i], rows[12, i], rows[13, i] = zero, zero, zero, zero
-            rows[0, i], rows[1, i], rows[2, i] = zero, zero, zero
             for c in range(3):
                 read_row(scale[c], albedo, b, c, y, 0)
-                for x in range(width):
-                    rows[3, i, x] += min(max(scale[c, x], zero), one) * third
                 read_row(rows[4 + c, i, :width], normal, b, c, y, 0)
-                for x in range(width):
-                    rows[4 + c, i, x] = min(max(rows[4 + c, i, x], -one), one)
+            _show_features(rows, i, scale, frames)
             _modulate(scale, factor)
             for c in range(3):
                 _exposed(lit[c], alone, recent, history, frames, scale[c], b, c, y)
-                for k in range(3):
-                    light, values = lit[c, k], rows[k, i]
-                    total = rows[11 + k, i]
-                    for x in range(width):
-                        light[x] = min(light[x], most)
-                        total[x] += light[x] * third
-                    compress_values(light)
-                    for x in range(width):
-                        values[x] += light[x] * third
-            for x in range(width):
-                own, near, far = rows[0, i, x], rows[1, i, x], rows[2, i, x]
-                rows[7, i, x], rows[8, i, x], rows[9, i, x] = abs(own - far), abs(near - far), abs(own - near)
+            _show_light(rows, i, lit)
             for k in range(14):
-                for x in range(width, blocks * BLOCK):
-                    rows[k, i, x] = rows[k, i, width - 1]
-        out[b, 18, block] = zero
-        for k in range(14):
-            means = out[b, k, block]
-            for x in range(blocks):
-                total = zero
-                for i in range(BLOCK):
-                    for j in range(BLOCK):
-                        total += rows[k, i, x * BLOCK + j]
-                means[x] = total * share
-            if k < 7:
-                variances = out[b, min(14 + k, 18), block]
-                for x in range(blocks):
-                    total = zero
-                    for i in range(BLOCK):
-                        for j in range(BLOCK):
-                            difference = rows[k, i, x * BLOCK + j] - means[x]
-                            total += difference * difference
-                    variances[x] = total * share + (variances[x] if k > 4 else zero)
+                rows[k, i, width:] = rows[k, i, width - 1]
+        _reduce(out, rows, b, block)
+
+
+@compiled
+def _show_features(rows: Any, i: int, albedo: Any, length: Any) -> None:
+    """A row of the albedo, the normal, and the part of the history."""
+    number = rows.dtype.type
+    zero, one, third = number(0), number(1), number(1 / 3)
+    for x in range(length.size):
+        rows[3, i, x] = zero
+        rows[10, i, x] = one - one / max(length[x], one)
+    for c in range(3):
+        for x in range(length.size):
+            rows[3, i, x] += min(max(albedo[c, x], zero), one) * third
+            rows[4 + c, i, x] = min(max(rows[4 + c, i, x], -one), one)
+
+
+@compiled
+def _show_light(rows: Any, i: int, lit: Any) -> None:
+    """A row of the three images, on the scale and as radiance, and of their differences; ``lit`` is overwritten."""
+    number = rows.dtype.type
+    third, most, zero = number(1 / 3), number(MAX_RADIANCE), number(0)
+    for k in range(3):
+        values, total = rows[k, i], rows[11 + k, i]
+        values[:], total[:] = zero, zero
+        for c in range(3):
+            light = lit[c, k]
+            for x in range(light.size):
+                light[x] = min(light[x], most)
+                total[x] += light[x] * third
+            compress_values(light)
+            for x in range(light.size):
+                values[x] += light[x] * third
+    for x in range(lit.shape[2]):
+        own, near, far = rows[0, i, x], rows[1, i, x], rows[2, i, x]
+        rows[7, i, x], rows[8, i, x], rows[9, i, x] = abs(own - far), abs(near - far), abs(own - near)
+
+
+@compiled
+def _reduce(out: Any, rows: Any, b: int, block: int) -> None:
+    """A row of blocks: the means, and the variances of the first seven, of which those of the normal are added."""
+    number = out.dtype.type
+    zero, share = number(0), number(1 / BLOCK**2)
+    out[b, 18, block] = zero
+    for k in range(14):
+        means, variances = out[b, k, block], out[b, min(14 + k, 18), block]
+        for x in range(means.size):
+            total = zero
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    total += rows[k, i, x * BLOCK + j]
+            means[x] = total * share
+        for x in range(means.size if k < 7 else 0):
+            total = zero
+            for i in range(BLOCK):
+                for j in range(BLOCK):
+                    difference = rows[k, i, x * BLOCK + j] - means[x]
+                    total += difference * difference
+            variances[x] = total * share + (variances[x] if k > 4 else zero)
 
 
 @compiled
