@@ -15,7 +15,7 @@ RIVALS = {"NBGD": "nbgd", "RAE (for ONND)": "rae", "KP": "kp", "MRKP": "mrkp", "
 OWN = {"P+K": "cascaded"}
 OTHERS = {"KPCN": "kpcn", "SBMC": "sbmc", "layered": "layered", "ANF": "anf", "NPPD": "nppd"}
 # Methods without weights, with the names of their models.
-FILTERS = {"SVGF": "svgf", "A-SVGF": "asvgf", "BMFR": "bmfr", "joint bilateral": "joint_bilateral"}
+FILTERS = {"SVGF": "svgf", "A-SVGF": "asvgf", "BMFR": "bmfr", "joint bilateral": "joint_bilateral", "guided": "guided"}
 # Methods of this package that Table 1 shows beside them, trained on other scenes or not at all.
 KEPT = {name: name for name in ("wild_small", "wild", "wild_large", "oidn_temporal")}
 # Variants of Tables 3 and 4: BWA is the bilateral weight adjustment, TL the temporal loss.

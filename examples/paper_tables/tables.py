@@ -53,6 +53,11 @@ from mcdenoise.turns import interleaved
 PROTOCOL_NAMES = ("strict", "meng2020", "fan2021")
 SMAPE = "linear SMAPE"
 SAME_INPUT = "joint bilateral of the accumulated image"
+# Open Image Denoise as it is best, and at its fastest.
+PEERS = {
+    name: {"quality": quality, "auxiliary": "clean", "source": "raw"}
+    for name, quality in {"OIDN": "high", "OIDN, fast": "fast"}.items()
+}
 SEEDS = (1, 2, 3)
 KINDS = ("random scenes", "leave one out")
 Errors = dict[str, float]  # by "protocol metric", and SMAPE of linear radiance
@@ -137,8 +142,8 @@ class Measured:
         return {name: mean(errors[name] for errors in known) for name in known[0]}
 
     def _denoiser(self, model: str, weights: Path | None) -> Denoiser:
-        if model == "oidn":
-            return Denoiser("oidn", quality="high", auxiliary="clean", source="raw")
+        if model in PEERS:
+            return Denoiser("oidn", **PEERS[model])
         if model == "accumulated":
             # Only its accumulated image is used, which is the input of all networks.
             return Denoiser(create_model("cascaded", width=4))
@@ -200,14 +205,13 @@ def table_1(measured: Measured) -> Table:
     every = {"noisy": of("accumulated", "noisy"), "accumulated": of("accumulated", "accumulated")}
     every |= {name: of(model) for name, model in RIVALS.items()}
     every |= {"P+K, initial": of("cascaded", "initial"), "P+K": of("cascaded")}
-    every |= {
-        name: of(model) for name, model in {**OTHERS, **FILTERS, SAME_INPUT: SAME_INPUT, **KEPT, "OIDN": "oidn"}.items()
-    }
+    every |= {name: of(model) for name, model in {**OTHERS, **FILTERS, **KEPT}.items()}
+    every |= {name: of(name) for name in (SAME_INPUT, *PEERS)}
     averages = {name: measured.average(errors) for name, errors in every.items()}
     for name, errors in every.items():
         cells = [found.cells(each) for each in [*errors, averages[name]]]
         found.rows += [[name, protocol, *(own[i] for own in cells)] for i, protocol in enumerate(PROTOCOL_NAMES)]
-    for name in (*RIVALS, *OTHERS, "SVGF", SAME_INPUT, "OIDN"):
+    for name in (*RIVALS, *OTHERS, "SVGF", SAME_INPUT, *PEERS):
         found.claim(f"P+K is ahead of {name}", every["P+K"], every[name])
     found.claim("the final image is ahead of the initial one", every["P+K"], every["P+K, initial"])
     return found
@@ -236,7 +240,7 @@ def table_2(measured: Measured) -> Table:
             lower, _, upper = quantiles(times[name][1:], n=4)
             middle = median(times[name][1:])
             part = _convolutions(model, frame)
-            parts = ["-", "-"] if name == "OIDN" else [f"{part * middle:.0f}", f"{(1 - part) * middle:.0f}"]
+            parts = ["-", "-"] if name in PEERS else [f"{part * middle:.0f}", f"{(1 - part) * middle:.0f}"]
             found.rows.append([name, f"{middle:.0f}", f"{lower:.0f} .. {upper:.0f}", *parts])
     return found
 
@@ -246,8 +250,8 @@ def _timed() -> dict[str, tuple[str, dict[str, Any]]]:
         name: (model, {}) for name, model in {**RIVALS, **OTHERS, **FILTERS}.items() if name != "BMFR"
     }
     orders = {name: ("cascaded", {"cascade": name, "width": 40 if "+" in name else 64}) for name in ORDERS}
-    quiet = {"quality": "high", "auxiliary": "clean", "source": "raw", "threads": torch.get_num_threads()}
-    return {**orders, **zoo, "OIDN": ("oidn", quiet)}
+    peers = {name: ("oidn", {**settings, "threads": torch.get_num_threads()}) for name, settings in PEERS.items()}
+    return {**orders, **zoo, **peers}
 
 
 def _convolutions(model: Any, frame: Frame) -> float:
