@@ -29,9 +29,9 @@ from torch import Tensor
 from mcdenoise.check.case import Case, Op, between, constant, map_tensors, tensors_in, times
 from mcdenoise.check.cases import OPS, STEPS
 from mcdenoise.check.regimes import Argument, checked, extreme, stiff
-from mcdenoise.errors import InputError, did_you_mean, in_one_line
+from mcdenoise.errors import InputError, did_you_mean
 from mcdenoise.methods import parse_method
-from mcdenoise.own import load_own
+from mcdenoise.own import load_own, refused
 
 ATTRIBUTE, BESIDE = "example_inputs", "inputs"
 # A Jacobian of this many results and inputs takes 128 MiB.
@@ -114,12 +114,9 @@ def _examples(name: str, function: Any, module: Any) -> Any:
         found = getattr(module, BESIDE, None)
     if not callable(found):
         return found
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            return found()
-    except Exception as error:
-        raise InputError(f"function '{name}': its example inputs fail: {in_one_line(error)}") from error
+    with refused(f"function '{name}': its example inputs fail"), torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return found()
 
 
 def _op(name: str, function: Any, examples: Any) -> Op:
@@ -193,11 +190,8 @@ def _check_tensors(where: str, tensors: Any) -> None:
 
 
 def _check_results(where: str, function: Any, tensors: Sequence[Tensor]) -> None:
-    try:
-        with torch.no_grad():
-            results = function(*(tensor.detach().double().clone() for tensor in tensors))
-    except Exception as error:
-        raise InputError(f"{where}: it fails in float64: {in_one_line(error)}") from error
+    with refused(f"{where}: it fails in float64"), torch.no_grad():
+        results = function(*map(_copy, tensors))
     parts = results if isinstance(results, tuple | list) else (results,)
     wrong = [part for part in parts if not isinstance(part, Tensor) or not part.is_floating_point()]
     if wrong or not parts:
