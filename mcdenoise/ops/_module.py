@@ -9,11 +9,10 @@ from typing import Any
 from torch import nn
 
 
-def module_of(name: str, function: Callable[..., Any], check: Callable[..., None] | None = None) -> type[nn.Module]:
-    """A module that stores the keyword arguments of a function and calls it with them.
+def module_of(function: Callable[..., Any], check: Callable[..., None] | None = None) -> type[nn.Module]:
+    """``KernelConv`` of ``kernel_conv``: a module that stores the keyword arguments and calls the function with them.
 
     Args:
-        name: of the class.
         function: its keyword-only arguments become those of the class, in order and with their defaults.
         check: takes the settings by name, and raises for those that the function would refuse.
     """
@@ -35,7 +34,7 @@ def module_of(name: str, function: Callable[..., Any], check: Callable[..., None
 
     forward.__doc__ = f"See :func:`mcdenoise.ops.{function.__name__}`."
     return type(
-        name,
+        function.__name__.title().replace("_", ""),
         (nn.Module,),
         {
             "__doc__": f":func:`mcdenoise.ops.{function.__name__}` with its settings stored.",

@@ -124,7 +124,7 @@ def affinity_filter(
     return (sums[:, :-1] / sums[:, -1:]).to(image.dtype)
 
 
-AffinityFilter = module_of("AffinityFilter", affinity_filter, _check_settings)
+AffinityFilter = module_of(affinity_filter, _check_settings)
 
 
 def _affine(

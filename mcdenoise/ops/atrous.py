@@ -101,7 +101,7 @@ def _check_settings(step: int, sigma_z: float, sigma_n: float, sigma_l: float) -
     check_sigmas(sigma_z, sigma_n, sigma_l)
 
 
-Atrous = module_of("Atrous", atrous, _check_settings)
+Atrous = module_of(atrous, _check_settings)
 
 
 def blurred(variance: Tensor) -> Tensor:

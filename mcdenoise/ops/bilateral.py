@@ -94,7 +94,7 @@ def check_settings(normalize: str, border: str) -> None:
     check_border(border)
 
 
-CrossBilateralWeights = module_of("CrossBilateralWeights", cross_bilateral_weights, check_settings)
+CrossBilateralWeights = module_of(cross_bilateral_weights, check_settings)
 
 
 def check_weights(

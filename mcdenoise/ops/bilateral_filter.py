@@ -74,4 +74,4 @@ def cross_bilateral_filter(
     return plain(kernel_conv)(image, weights, border="zeros" if left_out else border)
 
 
-CrossBilateralFilter = module_of("CrossBilateralFilter", cross_bilateral_filter, check_settings)
+CrossBilateralFilter = module_of(cross_bilateral_filter, check_settings)

@@ -157,5 +157,5 @@ def _taps(guide: Tensor, cell: int, rows: int, columns: int, bins: int) -> tuple
     return index.flatten(1), weight.flatten(1, 3)
 
 
-GridSplat = module_of("GridSplat", grid_splat, _check_settings)
-GridSlice = module_of("GridSlice", grid_slice, _check_settings)
+GridSplat = module_of(grid_splat, _check_settings)
+GridSlice = module_of(grid_slice, _check_settings)

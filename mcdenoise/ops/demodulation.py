@@ -77,8 +77,8 @@ def remodulate(image: Tensor, albedo: Tensor, *, floor: float = FLOOR) -> Tensor
     return (image.to(accumulator_dtype(image.dtype)) * modulation(albedo, floor)).to(image.dtype)
 
 
-Demodulate = module_of("Demodulate", demodulate)
-Remodulate = module_of("Remodulate", remodulate)
+Demodulate = module_of(demodulate)
+Remodulate = module_of(remodulate)
 
 
 def modulation(albedo: Tensor, floor: float = FLOOR) -> Tensor:

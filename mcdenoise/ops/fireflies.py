@@ -87,7 +87,7 @@ def _check_settings(limit: float | Tensor, kernel_size: int) -> None:
     check_kernel_size(kernel_size, 3)
 
 
-ClampFireflies = module_of("ClampFireflies", clamp_fireflies, _check_settings)
+ClampFireflies = module_of(clamp_fireflies, _check_settings)
 
 
 def _neighbours(values: Tensor, radius: int) -> Tensor:

@@ -118,4 +118,4 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     return (source + alpha.to(dtype) * upsample(coarse.to(dtype) - downsample(source), size)).to(fine.dtype)
 
 
-LaplacianFusion = module_of("LaplacianFusion", laplacian_fusion)
+LaplacianFusion = module_of(laplacian_fusion)

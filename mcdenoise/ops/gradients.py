@@ -160,7 +160,7 @@ def sums_of_strata(
     return difference, torch.where(size > _BLACK * (largest / unit), size, 0), noise
 
 
-TemporalGradient = module_of("TemporalGradient", temporal_gradient, _check_settings)
+TemporalGradient = module_of(temporal_gradient, _check_settings)
 
 
 def _middle(image: Tensor, stratum: int) -> Tensor:

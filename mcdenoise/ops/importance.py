@@ -67,7 +67,7 @@ def importance_filter(image: Tensor, importance: Tensor, *, kernel_size: int) ->
     return window.mean.to(image.dtype)
 
 
-ImportanceFilter = module_of("ImportanceFilter", importance_filter, _check_size)
+ImportanceFilter = module_of(importance_filter, _check_size)
 
 
 class _Window(NamedTuple):

@@ -122,8 +122,8 @@ def kernel_splat(image: Tensor, kernel: Tensor, *, border: Border = "replicate")
     return unpad(total, radius, border).to(image.dtype)
 
 
-KernelConv = module_of("KernelConv", kernel_conv, check_border)
-KernelSplat = module_of("KernelSplat", kernel_splat, check_border)
+KernelConv = module_of(kernel_conv, check_border)
+KernelSplat = module_of(kernel_splat, check_border)
 
 
 def _renormalized(values: Tensor, kernel: Tensor, kernel_size: int) -> Tensor:

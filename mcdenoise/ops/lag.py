@@ -94,7 +94,7 @@ def _check_settings(threshold: float, kernel_size: int) -> None:
     check_kernel_size(kernel_size, 3)
 
 
-HistoryLag = module_of("HistoryLag", history_lag, _check_settings)
+HistoryLag = module_of(history_lag, _check_settings)
 
 
 def _box(image: Tensor, kernel_size: int) -> Tensor:

@@ -120,4 +120,4 @@ def _check_settings(kernel_size: int, sigma_z: float, sigma_n: float) -> None:
     check_sigmas(sigma_z, sigma_n)
 
 
-MomentsVariance = module_of("MomentsVariance", moments_variance, _check_settings)
+MomentsVariance = module_of(moments_variance, _check_settings)

@@ -119,7 +119,7 @@ def _check_settings(block: int, offset: tuple[int, int], squares: int, ridge: fl
         raise ValueError(f"ridge: expected a positive number, found {ridge}")
 
 
-BlockRegression = module_of("BlockRegression", block_regression, _check_settings)
+BlockRegression = module_of(block_regression, _check_settings)
 
 
 def _to_blocks(image: Tensor, block: int, grid: tuple[int, int]) -> Tensor:

@@ -260,7 +260,7 @@ def accumulate(
     return accumulated.to(color.dtype), length.to(previous_length.dtype)
 
 
-Accumulate = module_of("Accumulate", accumulate)
+Accumulate = module_of(accumulate)
 
 
 def places_before(motion: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
