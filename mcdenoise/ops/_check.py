@@ -47,6 +47,13 @@ def check_shapes(**arguments: tuple[Tensor | None, str]) -> dict[str, int]:
     return sizes
 
 
+def check_half(name: str, image: Tensor, size: tuple[int, int]) -> None:
+    """``ValueError`` for an image that has not half of the height and width, rounded up."""
+    expected, found = tuple((side + 1) // 2 for side in size), tuple(image.shape[-2:])
+    if found != expected:
+        raise ValueError(f"{name}: expected height and width {expected} for size {size}, found {found}")
+
+
 def check_least(least: float, **settings: float) -> None:
     """``ValueError`` for a setting that is smaller, or NaN."""
     for name, value in settings.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_half, check_shapes
 from mcdenoise.ops._module import module_of
 from mcdenoise.ops._window import accumulator_dtype, block_means, corner, of_blocks
 
@@ -65,11 +65,7 @@ def upsample(image: Tensor, size: tuple[int, int]) -> Tensor:
         [[[[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]]]
     """
     check_shapes(image=(image, "B C H W"))
-    expected = tuple((side + 1) // 2 for side in size)
-    if tuple(image.shape[-2:]) != expected:
-        raise ValueError(
-            f"image: expected height and width {expected} for size {size}, found {tuple(image.shape[-2:])}"
-        )
+    check_half("image", image, size)
     if 0 in image.shape:
         return of_blocks(image, 2, *size)
     return corner(F.interpolate(image, scale_factor=2, mode="nearest"), *size)
@@ -107,9 +103,7 @@ def laplacian_fusion(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
     """
     sizes = check_shapes(fine=(fine, "B C H W"), coarse=(coarse, "B C h w"), alpha=(alpha, "B A H W"))
     size = (sizes["H"], sizes["W"])
-    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
-    if (sizes["h"], sizes["w"]) != half:
-        raise ValueError(f"coarse: expected height and width {half} for {size} of fine, found {sizes['h'], sizes['w']}")
+    check_half("coarse", coarse, size)
     if sizes["A"] not in (1, sizes["C"]):
         raise ValueError(f"alpha: expected 1 or {sizes['C']} channels, found {sizes['A']}")
     dtype = accumulator_dtype(fine.dtype)

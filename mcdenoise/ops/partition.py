@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._check import check_shapes
+from mcdenoise.ops._check import check_half, check_shapes
 from mcdenoise.ops._window import Border, accumulator_dtype, block_means, corner, unpad
 
 
@@ -92,12 +92,10 @@ def learned_upsample(image: Tensor, kernel: Tensor, size: tuple[int, int], *, bo
         raise ValueError(f"kernel: expected K*K channels with even K (4, 16, 36, ...), found {sizes['T']}")
     if border not in ("replicate", "zeros"):
         raise ValueError(f"border: expected 'replicate' or 'zeros', found {border!r}")
-    found, expected = (sizes["h"], sizes["w"]), tuple((length + 1) // 2 for length in size)
-    if found != expected:
-        raise ValueError(f"image: expected height and width {expected} for size {size}, found {found}")
+    check_half("image", image, size)
     dtype, margin = accumulator_dtype(image.dtype), side // 2 - 1
     if image.numel() == 0:
         return image.new_zeros(*image.shape[:2], *size)
     spread = (image.to(dtype)[:, :, None] * kernel.to(dtype)[:, None]).flatten(1, 2).flatten(2)
-    whole = (2 * (found[0] + margin), 2 * (found[1] + margin))
+    whole = (2 * (sizes["h"] + margin), 2 * (sizes["w"] + margin))
     return corner(unpad(F.fold(spread, whole, side, stride=2), margin, border), *size).to(image.dtype)
