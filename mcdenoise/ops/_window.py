@@ -31,11 +31,8 @@ def kernel_size_of(taps: int, name: str) -> int:
 
 def pad(image: Tensor, radius: int, border: Border) -> Tensor:
     """``image`` with ``radius`` more pixels on each side: its edge repeated, or zeros for the other modes."""
-    if radius == 0 or image.numel() == 0:
-        return F.pad(image, (radius,) * 4)
-    if border == "replicate":
-        return F.pad(image, (radius,) * 4, mode="replicate")
-    return F.pad(image, (radius,) * 4)
+    repeated = border == "replicate" and radius > 0 and image.numel() > 0
+    return F.pad(image, (radius,) * 4, mode="replicate" if repeated else "constant")
 
 
 def unpad(padded: Tensor, radius: int, border: Border) -> Tensor:
@@ -53,10 +50,8 @@ def _fold_edges(padded: Tensor, radius: int, size: int, dim: int) -> Tensor:
         return inner
     before = padded.narrow(dim, 0, radius).sum(dim, keepdim=True)
     after = padded.narrow(dim, radius + size, radius).sum(dim, keepdim=True)
-    rest = list(inner.shape)
-    rest[dim] = size - 1
-    zeros = inner.new_zeros(rest)
-    return inner + torch.cat([before, zeros], dim) + torch.cat([zeros, after], dim)
+    first, last = ((0, 0) * (-1 - dim) + margin for margin in ((0, size - 1), (size - 1, 0)))
+    return inner + F.pad(before, first) + F.pad(after, last)
 
 
 def taps(image: Tensor, kernel_size: int, border: Border) -> Iterator[Tensor]:

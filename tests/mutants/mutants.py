@@ -33,7 +33,7 @@ MUTANTS = tuple(
         # Borders, windows and half pixels.
         ("kernel_conv", "ops/kernel_conv.py", "torch.where(mask, kernel, 0).sum(1", "kernel.sum(1"),
         ("kernel_splat", "ops/_window.py", "tap // kernel_size - radius, tap", "radius - tap // kernel_size, tap"),
-        ("kernel_splat", "ops/_window.py", "[before, zeros], dim", "[zeros, before], dim"),
+        ("kernel_splat", "ops/_window.py", "F.pad(before, first)", "F.pad(before, last)"),
         ("upsample", "ops/fusion.py", 'mode="nearest"', 'mode="bilinear"'),
         (_LAG, "ops/lag.py", "(radius, 0), count_include_pad=False", "(radius, 0), count_include_pad=True"),
         (_MOTION, "ops/temporal.py", "device, dtype) + 0.5", "device, dtype)"),
