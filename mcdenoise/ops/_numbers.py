@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 
-def numbers_like(tensor: Tensor, values: Sequence[float], dtype: torch.dtype | None = None) -> Tensor:
-    """``tensor.new_tensor(values)``, one fill for each; in another dtype if that is given."""
-    return torch.cat([tensor.new_full((1,), value, dtype=dtype) for value in values])
+def numbers_like(tensor: Tensor, values: Sequence[float]) -> Tensor:
+    """``tensor.new_tensor(values)``, one fill for each."""
+    return torch.cat([tensor.new_full((1,), value) for value in values])
 
 
 def unit_of(largest: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def motion_from_position(position: Tensor, previous_view_projection: Tensor) -> 
         clip = clip + point[:, axis : axis + 1] * matrix[:, axis, :, None, None]
     w = clip[:, 3:]
     in_front = hit & (w > 0)
-    scale = numbers_like(position, [width, height], dtype).reshape(1, 2, 1, 1)
+    scale = numbers_like(point, [width, height]).reshape(1, 2, 1, 1)
     previous = (clip[:, :2] / torch.where(in_front, w, 1) + 1) / 2 * scale
     centre = _pixel_grid(height, width, position.device, dtype) + 0.5
     return torch.where(in_front, previous - centre, torch.inf)
