@@ -18,7 +18,8 @@ from mcdenoise.models._tza import archives_in, read_tza
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_open import OpenFilters
 from mcdenoise.nn.oidn import OidnUNet, oidn_exposure
-from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand
+from mcdenoise.ops._constants import MAX_RADIANCE
+from mcdenoise.ops._steps.transfer import compress, expand
 
 NAME = "oidn_open"
 

@@ -8,8 +8,6 @@ from torch import Tensor
 from mcdenoise.ops._constants import MAX_RADIANCE, PU_BRIGHT, PU_DARK, PU_JOINTS, PU_MIDDLE, PU_WHITE
 from mcdenoise.ops._op import op
 
-__all__ = ["MAX_RADIANCE", "compress", "expand", "seen_by_oidn"]
-
 
 @op("numba")
 def compress(radiance: Tensor) -> Tensor:

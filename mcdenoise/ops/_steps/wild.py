@@ -8,10 +8,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from mcdenoise.ops._constants import BLOCK, RECENT_ALPHA
+from mcdenoise.ops._constants import BLOCK, MAX_RADIANCE, RECENT_ALPHA
 from mcdenoise.ops._numbers import numbers_like
 from mcdenoise.ops._op import op
-from mcdenoise.ops._steps.transfer import MAX_RADIANCE, compress, expand, seen_by_oidn
+from mcdenoise.ops._steps.transfer import compress, expand, seen_by_oidn
 from mcdenoise.ops._window import corner, up_to_multiple
 from mcdenoise.ops.demodulation import demodulate, remodulate
 
