@@ -14,9 +14,9 @@ from torch import Tensor
 
 from mcdenoise.benchmark.machine import check_device, describe_machine, fix_threads
 from mcdenoise.benchmark.tables import write_ops_csv
-from mcdenoise.check.case import as_tuple, tensors_in
+from mcdenoise.check.case import DTYPES, as_tuple, tensors_in
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
-from mcdenoise.check.overview import DTYPES, relative_error
+from mcdenoise.check.overview import relative_error
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError, in_one_line
 from mcdenoise.models._stopwatch import Stopwatch

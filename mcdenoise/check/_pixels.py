@@ -245,7 +245,7 @@ OPS = (
     _SLICE,
     _FIREFLIES,
     _ATROUS,
-    checked(ops.luminance_moments, {"light": Argument(channels=3)}, image=uniform, least_dtype=torch.float32),
+    checked(ops.luminance_moments, {"light": Argument(channels=3)}, image=uniform),
     _VARIANCE,
     _REGRESSION,
 )

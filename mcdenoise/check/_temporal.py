@@ -159,7 +159,6 @@ _MOTION = checked(
     extreme("no image", (0, 3, 3, 4)),
     limits={},
     fireflies=None,
-    least_dtype=torch.float32,
     rounds=motion_rounds,
     # Behind the camera, motion is infinite.
     finite=False,
@@ -317,11 +316,7 @@ def _bright_corner(g: Generator, *shape: int) -> Tensor:
 _DRAWN = between(0.1, 3.0)
 _COLOR = Argument(_DRAWN, 3)
 STEPS = (
-    _step(
-        history.incoming,
-        {"color": Argument(sparks(_DRAWN, 400, (0, 0)), 3)},
-        least_dtype=torch.float32,
-    ),
+    _step(history.incoming, {"color": Argument(sparks(_DRAWN, 400, (0, 0)), 3)}),
     _step(history.lights, {"root": Argument(_bright_corner, 1)}),
     _step(
         history.blend,

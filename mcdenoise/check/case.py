@@ -19,6 +19,8 @@ Value = Tensor | list[Tensor] | Surface | None
 Inputs = dict[str, Value]
 # Takes a generator and a shape.
 Draw = Callable[..., Tensor]
+# In which ops are compared with themselves in float64.
+DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,6 @@ class Op:
     Args:
         function: the public function. In float64 it is the reference of all other dtypes and backends.
         cases: at least four cases, including ordinary ones.
-        least_dtype: minimum precision of the results; by default they have the dtype of the inputs.
         images: the arguments that are images in the same unit: the first result scales with them, and is constant if
             they are constant and the weights sum to one.
         weights: whether, with these settings, the results are non-negative weights that sum to one over the channels.
@@ -88,7 +89,6 @@ class Op:
 
     function: Callable[..., Any]
     cases: tuple[Case, ...]
-    least_dtype: torch.dtype | None = None
     images: tuple[str, ...] = ()
     weights: Callable[[dict[str, Any]], bool] = lambda settings: False
     rounds: Callable[[Any, dict[str, Any]], Mapping[str, Any]] = lambda inputs, settings: {}

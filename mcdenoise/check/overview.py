@@ -8,11 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.check.case import as_tuple, map_tensors
+from mcdenoise.check.case import DTYPES, as_tuple, map_tensors
 from mcdenoise.check.cases import OPS, Case, Op
 from mcdenoise.ops import use
-
-DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
 def overview() -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from mcdenoise.check.case import as_tuple, tensors_in
 from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.ops import _backend
 
@@ -29,18 +30,14 @@ def no_image_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
 def parted(op: Op, case: Case) -> tuple[Callable[..., Tensor], list[Tensor]]:
     """The op as a function of its differentiable arguments to all numbers of its results, and these arguments."""
     inputs = case.inputs()
-    leaves: list[Tensor] = []
-    names = [name for name in inputs if name in case.differentiable]
-    map_tensors(lambda tensor: leaves.append(tensor) or tensor, {name: inputs[name] for name in names})
+    chosen = {name: value for name, value in inputs.items() if name in case.differentiable}
 
     def function(*tensors: Tensor) -> Tensor:
         rest = iter(tensors)
-        given: Inputs = {**inputs, **map_tensors(lambda _: next(rest), {name: inputs[name] for name in names})}
-        result = op.function(**given, **case.settings)
-        results = [result] if isinstance(result, Tensor) else result
-        return torch.cat([part.flatten() for part in results])
+        given: Inputs = {**inputs, **map_tensors(lambda _: next(rest), chosen)}
+        return torch.cat([part.flatten() for part in as_tuple(op.function(**given, **case.settings))])
 
-    return function, leaves
+    return function, tensors_in(chosen)
 
 
 def drawn(like: Tensor, seed: int) -> Tensor:

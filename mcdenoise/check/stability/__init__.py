@@ -8,8 +8,9 @@ from functools import partial
 
 import torch
 
+from mcdenoise.check.case import DTYPES
 from mcdenoise.check.own import find_ops, note_of
-from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check
+from mcdenoise.check.stability._check import LONG_RUNS, Check
 from mcdenoise.check.stability._denoiser import VALID_SHOT, check_denoiser
 from mcdenoise.check.stability._long_runs import FRAMES, long_runs
 from mcdenoise.check.stability._models import check_model

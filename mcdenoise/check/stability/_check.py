@@ -1,4 +1,4 @@
-"""Results of stability checks, and the dtypes in which they run."""
+"""Results of stability checks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 
-DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 LONG_RUNS = "long runs"
 
 

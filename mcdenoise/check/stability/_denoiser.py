@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mcdenoise.check.stability._check import DTYPES, Check, bounded
+from mcdenoise.check.case import DTYPES
+from mcdenoise.check.stability._check import Check, bounded
 from mcdenoise.check.stability._frames import (
     ALLOWED,
     EXPOSURES,

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from mcdenoise.check.stability._check import DTYPES, LONG_RUNS, Check, bounded
+from mcdenoise.check.case import DTYPES
+from mcdenoise.check.stability._check import LONG_RUNS, Check, bounded
 from mcdenoise.ops import accumulate
 
 # More than 2048, the longest history that float16 counts.

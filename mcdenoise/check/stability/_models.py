@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mcdenoise.check.stability._check import DTYPES, Check, bounded
+from mcdenoise.check.case import DTYPES
+from mcdenoise.check.stability._check import Check, bounded
 from mcdenoise.check.stability._frames import ALLOWED, PATTERNS, relative_change, shots
 from mcdenoise.check.stability._rounding import Rounded
 from mcdenoise.frame import Frame

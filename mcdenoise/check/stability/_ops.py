@@ -38,9 +38,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.check import gradients
-from mcdenoise.check.case import Case, Op, map_tensors, tensors_in
+from mcdenoise.check.case import DTYPES, Case, Op, map_tensors, tensors_in
 from mcdenoise.check.own import op_of
-from mcdenoise.check.stability._check import DTYPES, Check, bounded
+from mcdenoise.check.stability._check import Check, bounded
 from mcdenoise.check.stability._rounding import spread
 from mcdenoise.check.stability._trial import Function, Trial, backends
 from mcdenoise.errors import in_one_line
@@ -307,7 +307,7 @@ def _check_exposure(trial: Trial, result: Tensor) -> Check:
     message = ""
     for exposure in _EXPOSURES:
         given: dict[str, Any] = trial.inputs
-        images = {name: exposure * given[name] for name in trial.images}
+        images = {name: exposure * given[name] for name in trial.op.images if name in given}
         if not all(bool(_normal_range(image).all()) for image in images.values()):
             continue
         scaled = replace(trial, inputs={**trial.inputs, **images})

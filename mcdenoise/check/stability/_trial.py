@@ -35,11 +35,6 @@ class Trial:
         return tensors_in(self.numbers)
 
     @property
-    def images(self) -> list[str]:
-        """The op's image arguments that the case has."""
-        return [name for name in self.op.images if name in self.inputs]
-
-    @property
     def inner(self) -> torch.dtype:
         """The dtype in which the op computes."""
         return self.dtype if self.op.own else accumulator_dtype(self.dtype)
