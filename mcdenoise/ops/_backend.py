@@ -36,7 +36,9 @@ def choose_backend(backends: Sequence[Backend], tensors: Sequence[Tensor]) -> Ba
     Raises:
         ValueError: the backend of :func:`use` cannot run; the message says why.
     """
-    wanted, strict = _used.get() or (_fastest(tensors), False)
+    pixels = max((tensor.shape[:1].numel() * tensor.shape[2:].numel() for tensor in tensors), default=0)
+    fastest: Backend = "torch" if pixels < _FEW_PIXELS else "numba"
+    wanted, strict = _used.get() or (fastest, False)
     obstacle = _obstacle(tensors, backends) if wanted == "numba" else ""
     if obstacle and strict:
         raise ValueError(f"backend: expected one that can run here, found {wanted!r}, which {obstacle}")
@@ -69,12 +71,6 @@ def use(backend: Backend, *, strict: bool = True) -> Iterator[None]:
         yield
     finally:
         _used.reset(token)
-
-
-def _fastest(images: Sequence[Tensor]) -> Backend:
-    """The backend that is fastest for images, of which the largest counts, if it can run."""
-    pixels = max((image.shape[:1].numel() * image.shape[2:].numel() for image in images), default=0)
-    return "torch" if pixels < _FEW_PIXELS else "numba"
 
 
 def _obstacle(tensors: Sequence[Tensor], backends: Sequence[Backend]) -> str:

@@ -36,15 +36,6 @@ class _Inputs(NamedTuple):
 
 def edge_average(*arguments: Any) -> tuple[Tensor, Tensor]:
     """See :func:`mcdenoise.ops._edges.edge_average`."""
-    inputs = _inputs(*arguments)
-    mean, variance = (torch.from_numpy(np.empty_like(each)) for each in (inputs.image, inputs.noise))
-    if mean.numel():
-        arrays = mean.numpy(), variance.numpy(), inputs
-        share_rows(mean, lambda *rows: _average(*arrays, *rows))
-    return mean, variance
-
-
-def _inputs(*arguments: Any) -> _Inputs:
     image, *_, kernel, step, sigma_z, sigma_n = arguments
     nothing = image.new_empty((len(image), 0, *image.shape[2:]))
     arrays = [
@@ -55,7 +46,11 @@ def _inputs(*arguments: Any) -> _Inputs:
     slope = np.empty((len(depth), 2 * depth.shape[1], *depth.shape[2:]), depth.dtype)
     if slope.size:
         share_rows(image, lambda *rows: _find_slopes(slope, depth, *rows))
-    return _Inputs._make([*arrays, *settings, step, slope])
+    inputs = _Inputs._make([*arrays, *settings, step, slope])
+    mean, variance = np.empty_like(inputs.image), np.empty_like(inputs.noise)
+    if mean.size:
+        share_rows(image, lambda *rows: _average(mean, variance, inputs, *rows))
+    return torch.from_numpy(mean), torch.from_numpy(variance)
 
 
 @compiled

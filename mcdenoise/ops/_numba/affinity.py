@@ -36,20 +36,15 @@ class _Inputs(NamedTuple):
 
 def affinity_filter(*arguments: Any) -> Tensor:
     """See :func:`mcdenoise.ops.affinity_filter`."""
-    image = arguments[0]
-    out = torch.empty(image.shape, dtype=accumulator_dtype(image.dtype), device="cpu")
-    if out.numel():
-        inputs = _inputs(*arguments)
-        share_rows(image, lambda *rows: _average(out.numpy(), inputs, *rows))
-    return out.to(image.dtype)
-
-
-def _inputs(*arguments: Any) -> _Inputs:
     image, *_, kernel_size, dilation = arguments
     dtype = accumulator_dtype(image.dtype)
-    nothing = torch.empty((0, 0, 0, 0), dtype=dtype, device="cpu")
-    tensors = [nothing if each is None else each.detach().to(dtype).contiguous() for each in arguments[:8]]
-    return _Inputs._make([*(tensor.numpy() for tensor in tensors), kernel_size, dilation])
+    out = torch.empty(image.shape, dtype=dtype, device="cpu")
+    if out.numel():
+        nothing = out.new_empty((0, 0, 0, 0))
+        tensors = [nothing if each is None else each.detach().to(dtype).contiguous() for each in arguments[:8]]
+        inputs = _Inputs._make([*(tensor.numpy() for tensor in tensors), kernel_size, dilation])
+        share_rows(image, lambda *rows: _average(out.numpy(), inputs, *rows))
+    return out.to(image.dtype)
 
 
 @compiled
