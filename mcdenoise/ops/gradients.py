@@ -95,50 +95,9 @@ def temporal_gradient(
         depth=(depth, "[B 1 H W]"),
     )
     _check_settings(stratum, levels, threshold, sigma_z, sigma_n)
-    difference, size, noise = sums_of_strata(
-        *(current, previous, weight, variance, normal, depth),
-        stratum=stratum,
-        levels=levels,
-        sigma_z=sigma_z,
-        sigma_n=sigma_n,
-    )
-    some = size > 0
-    size = torch.where(some, size, 1)
-    error = bounded_quotient(threshold * torch.sqrt(torch.where(noise > 0, noise, 1)), size)
-    excess = (difference / size).square() - torch.where(noise > 0, error.square(), 0)
-    found = some & (excess > 0)
-    gradient = torch.where(found, torch.sqrt(torch.where(found, excess, 1)).clamp_max(1), 0)
-    result = F.interpolate(gradient, scale_factor=stratum, mode="nearest")
-    return corner(result, current.shape[-2], current.shape[-1]).to(current.dtype)
-
-
-def _check_settings(stratum: int, levels: int, threshold: float, sigma_z: float, sigma_n: float) -> None:
-    check_least(1, stratum=stratum)
-    check_least(0, levels=levels, threshold=threshold)
-    check_sigmas(sigma_z, sigma_n)
-
-
-def sums_of_strata(
-    current: Tensor,
-    previous: Tensor,
-    weight: Tensor | None,
-    variance: Tensor | None,
-    normal: Tensor | None,
-    depth: Tensor | None,
-    *,
-    stratum: int,
-    levels: int,
-    sigma_z: float,
-    sigma_n: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``D``, ``M`` and ``V`` of :func:`temporal_gradient` after the filter, ``(B, 1, H / stratum, W / stratum)`` each.
-
-    In a unit of their own, in which the largest luminance and the largest weight are between 1 and 2, and ``M`` 0 where
-    it counts as that.
-    """
     dtype = accumulator_dtype(current.dtype)
     now, before = current.to(dtype), previous.to(dtype)
-    # So that no square leaves the range.
+    # In units in which the largest luminance and weight are between 1 and 2, so that no square leaves the range.
     largest = torch.maximum(now.detach(), before.detach()).abs().amax((1, 2, 3), keepdim=True)
     unit = unit_of(largest)
     now, before = now / unit, before / unit
@@ -156,8 +115,22 @@ def sums_of_strata(
         change, noise = edge_average(
             *(change, noise, normal, depth), kernel=(1.0, 1.0, 1.0), step=1 << level, sigma_z=sigma_z, sigma_n=sigma_n
         )
+    # ``D`` and ``M``. So little light counts as none.
     difference, size = change.split(1, 1)
-    return difference, torch.where(size > _BLACK * (largest / unit), size, 0), noise
+    some = size > _BLACK * (largest / unit)
+    size = torch.where(some, size, 1)
+    error = bounded_quotient(threshold * torch.sqrt(torch.where(noise > 0, noise, 1)), size)
+    excess = (difference / size).square() - torch.where(noise > 0, error.square(), 0)
+    found = some & (excess > 0)
+    gradient = torch.where(found, torch.sqrt(torch.where(found, excess, 1)).clamp_max(1), 0)
+    result = F.interpolate(gradient, scale_factor=stratum, mode="nearest")
+    return corner(result, current.shape[-2], current.shape[-1]).to(current.dtype)
+
+
+def _check_settings(stratum: int, levels: int, threshold: float, sigma_z: float, sigma_n: float) -> None:
+    check_least(1, stratum=stratum)
+    check_least(0, levels=levels, threshold=threshold)
+    check_sigmas(sigma_z, sigma_n)
 
 
 TemporalGradient = module_of(temporal_gradient, _check_settings)
