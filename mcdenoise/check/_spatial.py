@@ -27,7 +27,8 @@ from mcdenoise.check.case import (
     uniform,
 )
 from mcdenoise.check.regimes import HALF, IMAGE, SMALL, Argument, checked, extreme, half, ordinary, stiff
-from mcdenoise.ops._window import inside, offsets, pad, shifted
+from mcdenoise.ops._window import inside, kernel_size_of
+from mcdenoise.ops.bilateral import exponent_of
 
 _LOGITS = {"to +-1e4": times(1e4, normal), "of 1e4": times(1, normal, 1e4), "of both signs": alternating(1e4)}
 _TINY = torch.finfo(torch.float32).tiny / torch.finfo(torch.float32).eps
@@ -65,17 +66,10 @@ def _bilateral_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[
     |o_t|^2``, however small inputs and result are. A weight, ``w exp(exponent)``, has the same relative error.
     """
     border = settings.get("border", "replicate")
-    own, distance = inputs["kernel"].abs(), inputs.get("distance_falloff")
-    size = round(own.shape[1] ** 0.5)
-    terms = torch.zeros_like(own)
-    for guide, falloff in zip(inputs.get("guides", ()), inputs.get("falloffs", ()), strict=True):
-        padded = pad(guide, size // 2, border)
-        for tap, dy, dx in offsets(size):
-            difference = shifted(padded, size // 2, dy, dx, *own.shape[2:]) - guide
-            terms[:, tap : tap + 1] += falloff * difference.square().sum(1, keepdim=True)
-    if distance is not None:
-        squares = [dy * dy + dx * dx for _, dy, dx in offsets(size)]
-        terms = terms + distance * torch.tensor(squares, dtype=own.dtype)[:, None, None]
+    own, nothing = inputs["kernel"].abs(), torch.zeros_like(inputs["kernel"])
+    size = kernel_size_of(own.shape[1], "kernel")
+    guides = (inputs.get(name, ()) for name in ("guides", "falloffs"))
+    terms = -exponent_of(nothing, *guides, inputs.get("distance_falloff"), size, border)
     # Those outside have no weight.
     there = inside(own, size) | (border != "renormalize")
     terms = torch.where(there, terms, 0)

@@ -75,7 +75,7 @@ def cross_bilateral_weights(
     kernel_size = check_weights(kernel, guides, falloffs, distance_falloff, normalize, border)
     log_domain = normalize == "softmax"
     start = kernel if log_domain else torch.zeros_like(kernel)
-    exponent = _exponent(start, guides, falloffs, distance_falloff, kernel_size, border)
+    exponent = exponent_of(start, guides, falloffs, distance_falloff, kernel_size, border)
     if log_domain:
         if border == "renormalize":
             exponent = torch.where(inside(kernel, kernel_size), exponent, -torch.inf)
@@ -118,7 +118,7 @@ def check_weights(
     return kernel_size_of(sizes["T"], "kernel")
 
 
-def _exponent(
+def exponent_of(
     start: Tensor,
     guides: Sequence[Tensor],
     falloffs: Sequence[Tensor],
