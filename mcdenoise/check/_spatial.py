@@ -68,8 +68,8 @@ def _bilateral_rounds(inputs: dict[str, Any], settings: dict[str, Any]) -> dict[
     border = settings.get("border", "replicate")
     own, nothing = inputs["kernel"].abs(), torch.zeros_like(inputs["kernel"])
     size = kernel_size_of(own.shape[1], "kernel")
-    guides = (inputs.get(name, ()) for name in ("guides", "falloffs"))
-    terms = -exponent_of(nothing, *guides, inputs.get("distance_falloff"), size, border)
+    guides, falloffs, distance = inputs.get("guides", ()), inputs.get("falloffs", ()), inputs.get("distance_falloff")
+    terms = -exponent_of(nothing, guides, falloffs, distance, size, border)
     # Those outside have no weight.
     there = inside(own, size) | (border != "renormalize")
     terms = torch.where(there, terms, 0)
