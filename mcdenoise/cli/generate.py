@@ -23,7 +23,6 @@ from mcdenoise.scenes.takes.tracing import stratified
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _FRAMES = 12
-_NO_ASSETS = "none"
 
 
 def generate(
@@ -107,13 +106,13 @@ def generate(
                 finish((plan, seed), plan.render(seed, None if takes else begin(f"scene {seed}")))
             return None
         engine = RayEngine(rendering.workers, cpus=plan.threads, gpus=float(str(variant).startswith("cuda")))
-        failed = run_each(engine, render_seed, [(plan, seed) for seed in chosen], finish)
+        failed = run_each(engine, type(plan).render, [(plan, seed) for seed in chosen], finish)
     print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
     return 1 if failed else None
 
 
 def _opened(folder: str | None) -> Assets:
-    if folder == _NO_ASSETS:
+    if folder == "none":
         return Assets()
     return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
@@ -131,8 +130,3 @@ def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:
         **({"size": parse_size(rendering.size)} if "size" in given else {}),
         **({"half": stratified(rendering.reference_spp // 2)} if "reference_spp" in given else {}),
     }
-
-
-def render_seed(plan: Plan, seed: int) -> Path:
-    """A task: render what a plan makes of a seed."""
-    return plan.render(seed)
