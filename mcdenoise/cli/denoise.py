@@ -113,9 +113,9 @@ def denoise(
                     break
             clamped = write_radiance(out, pixels)
             if clamped:
-                warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
+                warn(f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them")
             if shot.alpha:
-                warn([f"{out}: the radiance alone, without the alpha; the format of the input keeps it"])
+                warn(f"{out}: the radiance alone, without the alpha; the format of the input keeps it")
 
 
 def _by_buffer(
@@ -151,7 +151,7 @@ def _denoise(
     # Before anything is printed about a shot that cannot be written.
     prepare_folder(opened, out)
     print_sequence(opened)
-    warn(filter(None, [spelling.doubt]))
+    warn(spelling.doubt)
     began = time.perf_counter()
     with progress_bar() as progress, _backend(opened, resolved):
         task = progress.add_task("denoise", total=len(opened))
@@ -188,7 +188,7 @@ def _denoise(
     if not features:
         # Said last but for warnings, where it is seen.
         say("NO FEATURES: turn on the passes albedo, normal and depth in the renderer; with them it is far better")
-    warn(report.warnings)
+    warn(*report.warnings)
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})

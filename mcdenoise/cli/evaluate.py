@@ -76,7 +76,7 @@ def evaluate(
             result = evaluate_folder(opened, images[0], protocol=protocol, on_frame=advance)
         else:
             denoiser = spelling.denoiser()
-            warn(filter(None, [spelling.doubt]))
+            warn(spelling.doubt)
             result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
     write_json(json, result.as_json())
@@ -95,7 +95,7 @@ def _evaluate_halves(
     first, other = (open_sequence(each, frames) for each in (sequence, half))
     with _progress(len(first)) as advance:
         result = evaluate_halves(first, other, {str(each): each for each in images}, advance)
-    warn(result.doubts)
+    warn(*result.doubts)
     best, *others = result.ranking
     errors = {name: result.error(name) for name in (best, *others)}
     print_rows([{"image": name, "error": f"{of:.3g}", "±": f"{margin:.2g}"} for name, (of, margin) in errors.items()])

@@ -78,8 +78,12 @@ def generate(
     arguments = rendering.arguments()
     # One variant for all machines, because it is part of the identity of a sequence.
     variant = None if renderer == "cycles" else choose_variant(rendering.variant)
-    common: dict[str, Any] = {"out": Path(os.path.abspath(out)), "unseen": unseen}
-    common |= {"threads": threads or int(workers is None), "assets": _opened(assets)}
+    common: dict[str, Any] = {
+        "out": Path(os.path.abspath(out)),
+        "threads": threads or int(workers is None),
+        "assets": Assets() if assets == "none" else open_assets(Path(assets or default_folder()), warn),
+        "unseen": unseen,
+    }
     plan: Plan
     if takes:
         plan = TakePlan(**common, variant=str(variant), plain=plain, **_of_takes(rendering, frames))
@@ -109,12 +113,6 @@ def generate(
         failed = run_each(engine, type(plan).render, [(plan, seed) for seed in chosen], finish)
     print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
     return 1 if failed else None
-
-
-def _opened(folder: str | None) -> Assets:
-    if folder == "none":
-        return Assets()
-    return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
 
 def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:
