@@ -38,6 +38,14 @@ def steps_of(task: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: progress.update(bar, completed=done, total=total)
 
 
+@contextmanager
+def frames_of(task: str, total: int) -> Iterator[Callable[..., None]]:
+    """A progress bar of one task, as a function that is called after each of its frames."""
+    with progress_bar() as progress:
+        bar = progress.add_task(task, total=total)
+        yield lambda *_: progress.advance(bar)
+
+
 def say(line: object) -> None:
     """Print a line that contains paths or other names; terminal control sequences in it are escaped."""
     print(printable(str(line)), flush=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out
-from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_of, warn, write_json
+from mcdenoise.cli._output import frames_of, print_times, say, stages, steps_of, warn, write_json
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
@@ -153,8 +153,7 @@ def _denoise(
     print_sequence(opened)
     warn(spelling.doubt)
     began = time.perf_counter()
-    with progress_bar() as progress, _backend(opened, resolved):
-        task = progress.add_task("denoise", total=len(opened))
+    with frames_of("denoise", len(opened)) as on_frame, _backend(opened, resolved):
         report = denoise_sequence(
             opened,
             out,
@@ -163,13 +162,13 @@ def _denoise(
             full_float=shot.full_float,
             output_layer=shot.output_layer,
             picked=choice,
-            on_frame=lambda: progress.advance(task),
+            on_frame=on_frame,
             on_written=preview.add if preview else on_written,
         )
-        taken = time.perf_counter() - began
-        if preview:
-            task = progress.add_task("preview", total=len(opened))
-            preview.close(on_frame=lambda: progress.advance(task))
+    taken = time.perf_counter() - began
+    if preview:
+        with frames_of("preview", len(opened)) as on_frame:
+            preview.close(on_frame=on_frame)
     for row in report.plan:
         say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
