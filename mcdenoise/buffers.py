@@ -87,7 +87,6 @@ def tells_motion(buffers: Collection[str]) -> bool:
 
 # Which axis of an array holds the channels.
 Layout: TypeAlias = Literal["HWC", "CHW"]
-LAYOUTS: tuple[Layout, ...] = ("HWC", "CHW")
 
 _MATRIX = BufferSpec(0, -_UNBOUNDED, _UNBOUNDED, "world-to-clip matrix")
 MATRIX = "view_projection"

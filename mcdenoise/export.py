@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -60,7 +60,7 @@ class Step(nn.Module):
         self.given = tuple(name for name in [*BUFFERS, "view_projection"] if name in buffers)
         self.given += tuple(sorted(set(buffers) - set(self.given)))
         check_needs(model.needs, self.given)
-        small, large = self._example(_SIZE, _BATCH), self._example(_OTHER_SIZE, _OTHER_BATCH)
+        small, large = _examples(self.given, _SIZE, _BATCH), _examples(self.given, _OTHER_SIZE, _OTHER_BATCH)
         self.axes = {name: _free_axes(small[name], large[name]) for name in self.given}
         # Use the structure of a state after the first frame; the graph keeps it.
         before, other = self._state_of(small), self._state_of(large)
@@ -76,19 +76,11 @@ class Step(nn.Module):
     def _state_of(self, buffers: Mapping[str, Tensor]) -> State:
         return self.model(self.frame(buffers))[1]
 
-    def _example(self, size: tuple[int, int], batch: int) -> dict[str, Tensor]:
-        return {name: _example(name, size, batch) for name in self.given}
-
-    def example(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Buffers of an example frame, and the state before the first frame."""
-        buffers = self._example(_SIZE, _BATCH)
-        return buffers, self.no_history(buffers)
-
     def no_history(self, buffers: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The state before the first frame of a shot with such buffers: zeros."""
         color = buffers["color"]
-        size, batch = (int(color.shape[-2]), int(color.shape[-1])), len(color)
-        leaves = pytree.tree_leaves(self._state_of(self._example(size, batch)))
+        size = int(color.shape[-2]), int(color.shape[-1])
+        leaves = pytree.tree_leaves(self._state_of(_examples(self.given, size, len(color))))
         named = zip(self._names, leaves, strict=True)
         return {name: torch.zeros_like(leaf, device=color.device) for name, leaf in named if name is not None}
 
@@ -111,12 +103,8 @@ class Step(nn.Module):
 
     def frame(self, buffers: Mapping[str, Tensor]) -> Frame:
         """Build the frame from buffers by name."""
-        known: dict[str, Any] = {
-            name: buffer
-            for name, buffer in buffers.items()
-            if name in BUFFERS or name in ("view_projection", "samples")
-        }
-        extra = {name: buffer for name, buffer in buffers.items() if name not in known}
+        known: dict[str, Any] = dict(buffers)
+        extra = {name: known.pop(name) for name in buffers if name not in (*BUFFERS, "view_projection", "samples")}
         return Frame(**known, extra=extra, hints=Hints(stages=False))
 
 
@@ -150,11 +138,9 @@ def traced(step: Step) -> torch.export.ExportedProgram:
         InputError: the method cannot be traced (it branches on the values of tensors or on the size of the image), or a
             state of zeros does not act as the state before the first frame.
     """
-    buffers, state = step.example()
-    dynamic = (
-        {name: step.axes[name] for name in buffers},
-        {name: step.axes[f"state.{name}"] for name in state},
-    )
+    buffers = _examples(step.given, _SIZE, _BATCH)
+    state = step.no_history(buffers)
+    dynamic = {name: step.axes[name] for name in buffers}, {name: step.axes[f"state.{name}"] for name in state}
     try:
         with torch.no_grad(), _quiet():
             program = torch.export.export(step.eval(), (buffers, state), dynamic_shapes=dynamic, strict=False)
@@ -236,7 +222,8 @@ def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterato
         InputError: onnxruntime is missing, or the frames lack a buffer.
     """
     onnxruntime = import_optional("onnxruntime", "a comparison", "export")
-    names = [name for name in exported.inputs if not name.startswith("state.")]
+    states = [name for name in exported.inputs if name.startswith("state.")]
+    names = [name for name in exported.inputs if name not in states]
     if absent := [name for name in names if name not in sequence.buffers | {"depth"}]:
         raise InputError(f"{sequence.root}: expected the buffer '{absent[0]}', which the graph takes, found none")
     options = onnxruntime.SessionOptions()
@@ -256,10 +243,7 @@ def differences(exported: Exported, model: Model, sequence: Sequence) -> Iterato
         # The exporter removes inputs that do not influence the result.
         feeds = {each.name: feeds[each.name] for each in session.get_inputs()}
         image, *after = session.run(list(exported.outputs), feeds)
-        state = {
-            name.replace("next_state.", "state."): value
-            for name, value in zip(exported.outputs[1:], after, strict=True)
-        }
+        state = dict(zip(states, after, strict=True))
         yield number, _difference(torch.from_numpy(image), expected)
 
 
@@ -326,6 +310,10 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(before)
+
+
+def _examples(names: Iterable[str], size: tuple[int, int], batch: int) -> dict[str, Tensor]:
+    return {name: _example(name, size, batch) for name in names}
 
 
 def _example(name: str, size: tuple[int, int], batch: int) -> Tensor:

@@ -14,7 +14,6 @@ from torch.utils import _pytree as pytree
 from mcdenoise.arrays import of_array, unmasked
 from mcdenoise.buffers import (
     BUFFERS,
-    LAYOUTS,
     MOTION,
     RADIANCE,
     BufferSpec,
@@ -24,11 +23,11 @@ from mcdenoise.buffers import (
     ordinary,
     tells_motion,
 )
-from mcdenoise.errors import InputError, did_you_mean
+from mcdenoise.errors import InputError, check_choice, did_you_mean
 from mcdenoise.light import Repairs, is_valid, repair, repairs_from
 
 # The vocabulary of buffers belongs to frames.
-__all__ = ["BUFFERS", "LAYOUTS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Layout"]
+__all__ = ["BUFFERS", "MOTION", "OF_RENDERERS", "RADIANCE", "BufferSpec", "Frame", "Hints", "Layout"]
 __all__ += ["Skip", "scale_samples", "tells_motion"]
 
 
@@ -158,20 +157,15 @@ class Frame:
         batch, _, height, width = self.color.shape
         for name, value in self.items():
             ordinary(f"buffer '{name}'", value)
-            if value.device != self.color.device:
-                raise InputError(
-                    f"buffer '{name}': expected on {self.color.device} like 'color', found on {value.device}"
-                )
             shape: tuple[int, ...] = (batch, 4, 4)
             if name != "view_projection":
                 found = value.shape[-3] if value.ndim > 2 else 1
                 channels = BUFFERS[name].channels if name in BUFFERS else max(found, 1)
                 samples = [max(count, 1) for count in value.shape[1:2]] if name == "samples" else []
                 shape = (batch, *samples, channels, height, width)
-            if tuple(value.shape) != shape:
-                raise InputError(f"buffer '{name}': expected shape {shape} like 'color', found {tuple(value.shape)}")
+            _check_like(f"buffer '{name}'", value, self.color, shape)
         for name, value in self.layers.items():
-            _check_layer(name, value, self.color)
+            _check_like(f"layer '{name}'", ordinary(f"layer '{name}'", value), self.color, tuple(self.color.shape))
 
     @classmethod
     def from_numpy(
@@ -210,8 +204,7 @@ class Frame:
             ...
             mcdenoise.errors.InputError: buffer 'color': expected shape (H, W, 3), found (3, 4, 6); pass layout='CHW'
         """
-        if layout not in LAYOUTS:
-            raise InputError(f"layout: expected one of {', '.join(LAYOUTS)}, found {layout!r}")
+        check_choice("layout", layout, Layout)
         if unknown := set(buffers) - OF_RENDERERS:
             known, near = sorted(OF_RENDERERS), did_you_mean(min(unknown), OF_RENDERERS)
             raise InputError(
@@ -403,10 +396,8 @@ def part_of_view(view: Tensor, size: tuple[int, int], rows: slice, columns: slic
     return view
 
 
-def _check_layer(name: str, layer: object, color: Tensor) -> None:
-    layer = ordinary(f"layer '{name}'", layer)
-    if layer.shape != color.shape or layer.device != color.device:
-        raise InputError(
-            f"layer '{name}': expected shape {tuple(color.shape)} on {color.device} like 'color', found "
-            f"{tuple(layer.shape)} on {layer.device}"
-        )
+def _check_like(what: str, value: Tensor, color: Tensor, shape: tuple[int, ...]) -> None:
+    if value.device != color.device:
+        raise InputError(f"{what}: expected on {color.device} like 'color', found on {value.device}")
+    if tuple(value.shape) != shape:
+        raise InputError(f"{what}: expected shape {shape} like 'color', found {tuple(value.shape)}")

@@ -1,7 +1,7 @@
 """Arrays in, an array out: what `Frame.from_numpy` and `denoise` take, in which layout, and what they refuse."""
 
 import re
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import torch
 from refusals import refused
 
 from mcdenoise import Denoiser, Frame, denoise
-from mcdenoise.frame import BUFFERS, LAYOUTS, Layout
+from mcdenoise.frame import BUFFERS, Layout
 
 HEIGHT, WIDTH = 5, 7
 MODEL = "wild_small"
@@ -23,7 +23,7 @@ def image(channels: int, layout: Layout = "HWC", *, seed: int = 0, dtype: Any = 
     return pixels if layout == "HWC" else np.ascontiguousarray(np.moveaxis(pixels, -1, 0))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", get_args(Layout))
 def test_every_buffer_of_a_renderer_arrives_in_its_place(layout: Layout) -> None:
     names = [name for name in BUFFERS if name not in OWN]
     arrays = {name: image(BUFFERS[name].channels, layout, seed=seed) for seed, name in enumerate(names)}

@@ -22,7 +22,7 @@ MODULES = {
 SIGNAL = {"buffers", "errors", "frame", "light", "motion", "noise", "ops", "reading", "sampling"}
 LIBRARY = SIGNAL | {"metrics", "nn", "models", "data", "scenes", "denoiser", "sequence_report"}
 REPORTS = {"benchmark", "check", "evaluate", "folder", "methods", "report"}
-TOOLS = REPORTS | {"budget", "demo", "export", "film", "preview", "suite", "train"}
+TOOLS = REPORTS | {"budget", "export", "film", "preview", "suite", "train"}
 ALLOWED: dict[str, set[str]] = {
     "errors": set(),
     "heap": set(),

@@ -126,11 +126,10 @@ def _run(name: str, arguments: list[str]) -> int:
     except SystemExit as stop:
         # The help of the command was printed.
         return int(stop.code or 0)
-    given: dict[str, Any] = getattr(command, "keywords", {})
-    if given.get("json") is not None:
+    if command.keywords.get("json") is not None:
         from mcdenoise.cli._output import check_json
 
-        check_json(given)
+        check_json(command.keywords)
     try:
         return command() or 0
     except SystemExit as stop:
@@ -162,7 +161,7 @@ def load_command(name: str) -> Command:
     return command
 
 
-def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
+def parse(name: str, arguments: list[str]) -> functools.partial[int | None]:
     """Parse the arguments of a command, and return a function that runs it.
 
     Args:
@@ -179,7 +178,7 @@ def parse(name: str, arguments: list[str]) -> Callable[[], int | None]:
 
     command, prog = load_command(name), f"mcdenoise {name}"
 
-    def bind(*args: Any, **kwargs: Any) -> Callable[[], int | None]:
+    def bind(*args: Any, **kwargs: Any) -> functools.partial[int | None]:
         return functools.partial(command, *args, **kwargs)
 
     bind.__signature__ = signature(command)  # type: ignore[attr-defined]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -36,6 +36,14 @@ def steps_of(task: str) -> Iterator[Callable[[int, int], None]]:
     with progress_bar() as progress:
         bar = progress.add_task(task, total=None)
         yield lambda done, total: progress.update(bar, completed=done, total=total)
+
+
+@contextmanager
+def frames_of(task: str, total: int) -> Iterator[Callable[..., None]]:
+    """A progress bar of one task, as a function that is called after each of its frames."""
+    with progress_bar() as progress:
+        bar = progress.add_task(task, total=total)
+        yield lambda *_: progress.advance(bar)
 
 
 def say(line: object) -> None:
@@ -70,9 +78,9 @@ def stages(milliseconds: dict[str, float]) -> str:
     return ", ".join(f"{stage} {value:.1f}" for stage, value in milliseconds.items())
 
 
-def warn(warnings: Iterable[str]) -> None:
-    """Print warnings to stderr, one per line."""
-    for warning in warnings:
+def warn(*warnings: str) -> None:
+    """Print warnings to stderr, one per line; an empty one is none."""
+    for warning in filter(None, warnings):
         print(f"warning: {printable(warning)}", file=sys.stderr)
 
 

@@ -121,7 +121,7 @@ def benchmark(
     tried = {
         each.model: Spelling(each.model, None, each.settings) for each in methods if not each.weights + each.missing
     }
-    warn(filter(None, (each.doubt for each in tried.values())))
+    warn(*(each.doubt for each in tried.values()))
     with steps_of("benchmark") as on_step:
         results = run_benchmark(opened, methods, out, settings, on_step=on_step)
     print_rows(scene_rows(results))

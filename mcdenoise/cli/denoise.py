@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mcdenoise import ops
 from mcdenoise.cli._options import Flag, Inputs, Json, Layers, Map, Out
-from mcdenoise.cli._output import print_times, progress_bar, say, stages, steps_of, warn, write_json
+from mcdenoise.cli._output import frames_of, print_times, say, stages, steps_of, warn, write_json
 from mcdenoise.cli.inspect import print_sequence
 from mcdenoise.data import Sequence
 from mcdenoise.data.color_space import to_rec709
@@ -113,9 +113,9 @@ def denoise(
                     break
             clamped = write_radiance(out, pixels)
             if clamped:
-                warn([f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them"])
+                warn(f"{out}: {clamped:.1%} of the pixels are brighter than white, and were clamped; .exr keeps them")
             if shot.alpha:
-                warn([f"{out}: the radiance alone, without the alpha; the format of the input keeps it"])
+                warn(f"{out}: the radiance alone, without the alpha; the format of the input keeps it")
 
 
 def _by_buffer(
@@ -151,10 +151,9 @@ def _denoise(
     # Before anything is printed about a shot that cannot be written.
     prepare_folder(opened, out)
     print_sequence(opened)
-    warn(filter(None, [spelling.doubt]))
+    warn(spelling.doubt)
     began = time.perf_counter()
-    with progress_bar() as progress, _backend(opened, resolved):
-        task = progress.add_task("denoise", total=len(opened))
+    with frames_of("denoise", len(opened)) as on_frame, _backend(opened, resolved):
         report = denoise_sequence(
             opened,
             out,
@@ -163,13 +162,13 @@ def _denoise(
             full_float=shot.full_float,
             output_layer=shot.output_layer,
             picked=choice,
-            on_frame=lambda: progress.advance(task),
+            on_frame=on_frame,
             on_written=preview.add if preview else on_written,
         )
-        taken = time.perf_counter() - began
-        if preview:
-            task = progress.add_task("preview", total=len(opened))
-            preview.close(on_frame=lambda: progress.advance(task))
+    taken = time.perf_counter() - began
+    if preview:
+        with frames_of("preview", len(opened)) as on_frame:
+            preview.close(on_frame=on_frame)
     for row in report.plan:
         say(f"  {row['stage']}: {_kept(row)} ({row['reason']}){'' if row['exact'] else ', up to the tolerance'}")
     if report.replaced_pixels:
@@ -188,7 +187,7 @@ def _denoise(
     if not features:
         # Said last but for warnings, where it is seen.
         say("NO FEATURES: turn on the passes albedo, normal and depth in the renderer; with them it is far better")
-    warn(report.warnings)
+    warn(*report.warnings)
     files = list(report.files.values())
     names = files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}"
     write_json(json, {"model": report.model, "milliseconds": report.milliseconds, "beside": report.beside})

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from mcdenoise.cli._options import Json
-from mcdenoise.cli._output import print_rows, progress_bar, say, warn, write_json
+from mcdenoise.cli._output import frames_of, print_rows, say, warn, write_json
 from mcdenoise.data import open_sequence
 from mcdenoise.data.readers.files import RenderedFiles
 from mcdenoise.errors import InputError
@@ -71,31 +69,24 @@ def evaluate(
         say(f"{sequence} has no references, and is taken as the reference")
     spelling = None if model is None else parse_method(model)
     total = len(opened.reference_numbers if spelling is None else opened.numbers)
-    with _progress(total) as advance:
+    with frames_of("evaluate", total) as advance:
         if spelling is None:
             result = evaluate_folder(opened, images[0], protocol=protocol, on_frame=advance)
         else:
             denoiser = spelling.denoiser()
-            warn(filter(None, [spelling.doubt]))
+            warn(spelling.doubt)
             result = evaluate_method(opened, denoiser, spelling.name, protocol=protocol, on_frame=advance)
     _print_evaluation(result)
     write_json(json, result.as_json())
-
-
-@contextmanager
-def _progress(total: int) -> Iterator[Callable[[int], None]]:
-    with progress_bar() as progress:
-        task = progress.add_task("evaluate", total=total)
-        yield lambda _: progress.advance(task)
 
 
 def _evaluate_halves(
     sequence: Path, half: Path, images: tuple[Path, ...], frames: str | None, json: Path | None
 ) -> None:
     first, other = (open_sequence(each, frames) for each in (sequence, half))
-    with _progress(len(first)) as advance:
+    with frames_of("evaluate", len(first)) as advance:
         result = evaluate_halves(first, other, {str(each): each for each in images}, advance)
-    warn(result.doubts)
+    warn(*result.doubts)
     best, *others = result.ranking
     errors = {name: result.error(name) for name in (best, *others)}
     print_rows([{"image": name, "error": f"{of:.3g}", "±": f"{margin:.2g}"} for name, (of, margin) in errors.items()])

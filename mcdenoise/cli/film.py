@@ -51,7 +51,7 @@ def film(
     for settings in {each.settings.model: each.settings for each in shots if each.settings.model}.values():
         # The check of the film names a shot whose model cannot be made.
         with suppress(InputError):
-            warn(filter(None, [settings.spelling.doubt]))
+            warn(settings.spelling.doubt)
     if count is None:
         gpus = any(each.settings.device.startswith("cuda") for each in shots)
         engine: Engine = RayEngine(workers, cpus=max(each.settings.threads or 1 for each in shots), gpus=float(gpus))
@@ -69,7 +69,7 @@ def film(
         results = run_film(shots, out, engine, piece=piece, on_progress=show, on_shot=_print_shot)
     for each in results:
         if each.found is not None:
-            warn(f"{each.shot.name}: {warning}" for warning in each.found.warnings)
+            warn(*(f"{each.shot.name}: {warning}" for warning in each.found.warnings))
     print_rows(
         [
             {"shot": each.shot.name, "frames": frames, "failed": why}
@@ -81,7 +81,7 @@ def film(
     try:
         page = f", {write_page(results, out)}"
     except InputError as error:
-        warn([str(error)])
+        warn(str(error))
     seconds, made = time.perf_counter() - began, sum(each.made for each in results)
     rate = f", {made / seconds:.2f}/s" if made else ""
     done = sum(each.complete for each in results)

@@ -23,7 +23,6 @@ from mcdenoise.scenes.takes.tracing import stratified
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
 _FRAMES = 12
-_NO_ASSETS = "none"
 
 
 def generate(
@@ -79,8 +78,12 @@ def generate(
     arguments = rendering.arguments()
     # One variant for all machines, because it is part of the identity of a sequence.
     variant = None if renderer == "cycles" else choose_variant(rendering.variant)
-    common: dict[str, Any] = {"out": Path(os.path.abspath(out)), "unseen": unseen}
-    common |= {"threads": threads or int(workers is None), "assets": _opened(assets)}
+    common: dict[str, Any] = {
+        "out": Path(os.path.abspath(out)),
+        "threads": threads or int(workers is None),
+        "assets": Assets() if assets == "none" else open_assets(Path(assets or default_folder()), warn),
+        "unseen": unseen,
+    }
     plan: Plan
     if takes:
         plan = TakePlan(**common, variant=str(variant), plain=plain, **_of_takes(rendering, frames))
@@ -107,15 +110,9 @@ def generate(
                 finish((plan, seed), plan.render(seed, None if takes else begin(f"scene {seed}")))
             return None
         engine = RayEngine(rendering.workers, cpus=plan.threads, gpus=float(str(variant).startswith("cuda")))
-        failed = run_each(engine, render_seed, [(plan, seed) for seed in chosen], finish)
+        failed = run_each(engine, type(plan).render, [(plan, seed) for seed in chosen], finish)
     print_rows([{"scene": f"seed {seed}", "failed": reason} for (_, seed), reason in failed])
     return 1 if failed else None
-
-
-def _opened(folder: str | None) -> Assets:
-    if folder == _NO_ASSETS:
-        return Assets()
-    return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
 
 
 def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:
@@ -131,8 +128,3 @@ def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:
         **({"size": parse_size(rendering.size)} if "size" in given else {}),
         **({"half": stratified(rendering.reference_spp // 2)} if "reference_spp" in given else {}),
     }
-
-
-def render_seed(plan: Plan, seed: int) -> Path:
-    """A task: render what a plan makes of a seed."""
-    return plan.render(seed)

@@ -80,4 +80,4 @@ def print_sequence(sequence: Sequence) -> None:
     if sequence.unknown:
         names = printable(", ".join(sequence.unknown))
         print(f"unknown: {names}; read them with --map BUFFER=LAYER or --layers LAYER")
-    warn(sequence.warnings)
+    warn(*sequence.warnings)

@@ -47,7 +47,7 @@ def models(all: Flag = False, ops: Flag = False, json: Json = None) -> None:
     print(_WEIGHTS if all else "`mcdenoise models --all` also lists the methods to compare with")
     if hidden:
         print(f"not shown, for lack of width (see --json): {', '.join(sorted(hidden))}")
-    warn(troubles())
+    warn(*troubles())
     write_json(json, [asdict(entry) for entry in entries])
 
 

@@ -153,4 +153,4 @@ def _print_errors(errors: Mapping[str, float], expected: tuple[float, float] | N
     if found <= smape + tolerance:
         print(f"{line}: met")
     else:
-        warn([f"{line}: missed"])
+        warn(f"{line}: missed")

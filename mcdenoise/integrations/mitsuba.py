@@ -185,22 +185,16 @@ class MitsubaDenoiser:
 
     def _split(self, bitmap: Any) -> dict[str, Any]:
         """The layers of a bitmap by name. ``mi.Bitmap.split`` fails on some that were written to a file and read."""
-        try:
-            return dict(bitmap.split())
-        except RuntimeError:
-            names = [field.name for field in bitmap.struct_()]
-        places: dict[str, list[int]] = {}
-        for place, name in enumerate(names):
-            places.setdefault(name.rpartition(".")[0] or _ROOT, []).append(place)
+        places: dict[str, dict[str, int]] = {}
+        for place, field in enumerate(bitmap.struct_()):
+            name, _, letter = field.name.rpartition(".")
+            places.setdefault(name or _ROOT, {})[letter] = place
         pixels, layers = np.array(bitmap), {}
         for name, own in places.items():
-            letters = {names[place].rpartition(".")[2]: place for place in own}
-            order = [letter for letter in "RGBXYZA" if letter in letters]
-            kind = "".join(order) if len(order) == len(own) else ""
-            # Vectors have these components, too, and are in no color space.
-            known = kind in (*_FORMATS, "XYZ", "XYZA") and (name == _ROOT or not kind.startswith("XYZ"))
-            form = getattr(self._mi.Bitmap.PixelFormat, kind if known else "MultiChannel")
-            chosen = [letters[letter] for letter in order] if known else own
+            letters = sorted(own, key="RGBXYZA".find)
+            kind = "".join(letters)
+            form = getattr(self._mi.Bitmap.PixelFormat, kind if kind in _FORMATS else "MultiChannel")
+            chosen = [own[letter] for letter in letters]
             layers[name] = self._mi.Bitmap(np.ascontiguousarray(pixels[..., chosen]), form)
         return layers
 
