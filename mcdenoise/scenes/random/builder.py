@@ -53,18 +53,18 @@ class SceneBuilder:
     """Collects materials, shapes and lights as a Mitsuba dictionary.
 
     ``low`` and ``high`` are the bounds for people and cameras. ``points`` are points of interest for cameras.
-    ``groups`` are movable objects, with the ids of their shapes. ``lamps`` are the ids of the emitting shapes.
+    ``groups`` are the ids of the shapes of each movable object, ``lamps`` those of the emitting shapes.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
         self.low, self.high = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
         self.points: list[Array] = []
-        self.groups: dict[str, list[str]] = {}
+        self.groups: list[list[str]] = []
         self.lamps: list[str] = []
         self._materials: dict[str, Any] = {}
         self._objects: dict[str, Any] = {}
         self._lights: dict[str, Any] = {}
-        self._sky: dict[str, Any] | None = None
+        self._sky: dict[str, Any] = {}
         self._bounds: list[tuple[Array, Array]] = []
 
     def material(self, bsdf: Bsdf) -> dict[str, str]:
@@ -97,7 +97,7 @@ class SceneBuilder:
             self._bounds.append(bounds(part.kind, matrix))
             names.append(name)
         if movable:
-            self.groups[f"group_{len(self.groups)}"] = names
+            self.groups.append(names)
         return names
 
     def add_light(self, light: dict[str, Any]) -> None:
@@ -106,7 +106,7 @@ class SceneBuilder:
 
     def set_sky(self, image: Array) -> None:
         """Set the environment light, a lat-long image whose top row is the zenith."""
-        self._sky = {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}
+        self._sky = {"sky": {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}}
 
     def placed(self, name: str) -> Array:
         """Transform of a shape from its own space to world space."""
@@ -114,13 +114,12 @@ class SceneBuilder:
 
     def boxes(self) -> tuple[Array, Array]:
         """Lower and upper corners ``(N, 3)`` of the bounding boxes of all shapes, in order of insertion."""
-        lows, highs = ([box[end] for box in self._bounds] for end in (0, 1))
-        return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
+        lows, highs = np.array(self._bounds).reshape(-1, 2, 3).swapaxes(0, 1)
+        return lows, highs
 
     def scene(self) -> dict[str, Any]:
         """The Mitsuba dictionary of what is there; a shape of the type ``"mesh"`` holds its triangles."""
-        sky = {} if self._sky is None else {"sky": self._sky}
-        return {"type": "scene", **self._materials, **self._objects, **self._lights, **sky}
+        return {"type": "scene", **self._materials, **self._objects, **self._lights, **self._sky}
 
 
 def scene_of(parts: Mapping[str, Part]) -> dict[str, Any]:
@@ -152,10 +151,7 @@ def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
 
 def place(position: Vector, turn: float = 0, scale: Vector = (1, 1, 1), rotation: Array | None = None) -> Array:
     """A transform: scale, rotate, rotate about the vertical axis by ``turn`` degrees, translate."""
-    matrix = rotate("y", turn)
-    if rotation is not None:
-        matrix = matrix @ rotation
-    matrix = matrix @ np.diag((*scale, 1.0))
+    matrix = rotate("y", turn) @ (np.eye(4) if rotation is None else rotation) @ np.diag((*scale, 1.0))
     matrix[:3, 3] = position
     return np.asarray(matrix)
 
@@ -172,8 +168,7 @@ def rotate(axis: str, degrees: float) -> Array:
 
 def box(center: Vector, size: Vector, material: Bsdf, turn: float = 0, tilt: float = 0) -> Part:
     """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
-    half_size = [0.5 * length for length in size]
-    return Part("cube", place(center, turn, half_size, rotate("x", tilt)), material)
+    return Part("cube", place(center, turn, [0.5 * length for length in size], rotate("x", tilt)), material)
 
 
 def ball(center: Vector, radius: float, material: Bsdf, radiance: Color | None = None) -> Part:
@@ -206,11 +201,7 @@ def plate(center: Vector, radius: float, material: Bsdf, up: bool = True) -> Par
 
 
 def sheet(
-    center: Vector,
-    half_size: Vector,
-    material: Bsdf,
-    rotation: Array,
-    radiance: Color | None = None,
+    center: Vector, half_size: Vector, material: Bsdf, rotation: Array | None = None, radiance: Color | None = None
 ) -> Part:
     """A rectangle that faces +z before the rotation."""
     return Part("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)

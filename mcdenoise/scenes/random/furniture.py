@@ -46,10 +46,10 @@ def picture_frame(builder: SceneBuilder, rng: Rng) -> list[Part]:
     image = builder.material(diffuse(picture(rng)))
     parts = [
         box((0, 0, 0.02), (width + 0.1, height + 0.1, 0.04), frame),
-        sheet((0, 0, 0.045), (width / 2, height / 2), image, np.eye(4)),
+        sheet((0, 0, 0.045), (width / 2, height / 2), image),
     ]
     if rng.random() < 0.3:
-        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), builder.material(pane()), np.eye(4)))
+        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), builder.material(pane())))
     return parts
 
 

@@ -233,9 +233,9 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | 
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
         if glow is not None:
             black = builder.material(diffuse((0.02, 0.02, 0.02)))
-            parts.append(sheet((x, sill + tall / 2, -_WALL - 0.02), (wide / 2, tall / 2), black, np.eye(4), glow))
+            parts.append(sheet((x, sill + tall / 2, -_WALL - 0.02), (wide / 2, tall / 2), black, radiance=glow))
         if glazed:
-            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
+            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane())))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
             tilt, slat = float(rng.uniform(-50, 50)), (wide, 0.004, tall / slats * 0.9)

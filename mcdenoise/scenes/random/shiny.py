@@ -105,8 +105,8 @@ def _glass_picture(builder: SceneBuilder, rng: Rng) -> Array:
     half_size = rng.uniform(0.2, 0.4) * min(width, 3.0), rng.uniform(0.2, 0.4) * min(height, 2.6)
     image = builder.material(diffuse(_contrast(rng, texture(rng))))
     parts = [
-        sheet((0, 0, 0.03), half_size, image, np.eye(4)),
-        sheet((0, 0, float(rng.uniform(0.05, 0.3))), half_size, builder.material(pane()), np.eye(4)),
+        sheet((0, 0, 0.03), half_size, image),
+        sheet((0, 0, float(rng.uniform(0.05, 0.3))), half_size, builder.material(pane())),
     ]
     builder.add(parts, frame)
     return np.asarray(frame[:3, 3])
@@ -127,7 +127,7 @@ def _standing_pane(builder: SceneBuilder, rng: Rng) -> Array:
     rim = builder.material(random_metal(rng))
     parts: list[Part] = []
     if rng.random() < 0.7:
-        parts.append(sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
+        parts.append(sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane())))
     else:
         parts.append(box((0, tall / 2, 0), (wide, tall, 0.03), builder.material(glass())))
     for side in (-1, 1):
