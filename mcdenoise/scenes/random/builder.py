@@ -17,6 +17,8 @@ from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
 
+# Rotation about the vertical axis that turns +z into the room, for each wall: at -z, -x, +z and +x.
+TURNS = (0.0, 90.0, 180.0, -90.0)
 # Least and largest z of a shape in its own space, where they are not -1 and 1, as those of x and y are.
 _BOUNDS = {"cylinder": (0, 1), "disk": (0, 0), "rectangle": (0, 0)}
 
@@ -107,6 +109,11 @@ class SceneBuilder:
     def set_sky(self, image: Array) -> None:
         """Set the environment light, a lat-long image whose top row is the zenith."""
         self._sky = {"sky": {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}}
+
+    def surface(self) -> float:
+        """Area of the sides of the bounds, floor and ceiling included, square metres."""
+        width, height, depth = self.high - self.low
+        return float(2 * (width * height + height * depth + depth * width))
 
     def placed(self, name: str) -> Array:
         """Transform of a shape from its own space to world space."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.random.builder import SceneBuilder, bounds, rotate
-from mcdenoise.scenes.random.textures import Rng
+from mcdenoise.scenes.random.textures import Rng, log_uniform
 
 # Last frame of a path; a longer shot goes back and forth.
 _HORIZON = 16
@@ -101,7 +101,7 @@ def _score(boxes: tuple[Array, Array], view: _View) -> float:
 
 def _way_to_move(view: _View, rng: Rng) -> Callable[[int], _View]:
     """A movement of 0.3 to 12 pixels per frame in an image 256 pixels wide."""
-    speed = float(np.exp(rng.uniform(math.log(0.3), math.log(12))))
+    speed = log_uniform(rng, 0.3, 12)
     angle = math.radians(view.fov_x) / 256 * speed
     forward = view.target - view.origin
     length = float(np.linalg.norm(forward))

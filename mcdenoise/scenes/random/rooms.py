@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import SceneBuilder, ball, box, place, rod, sheet
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, ball, box, place, rod, sheet
 from mcdenoise.scenes.random.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
-from mcdenoise.scenes.random.lights import sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.lights import daylight, sky, softbox, studio
 from mcdenoise.scenes.random.materials import (
     Bsdf,
     diffuse,
@@ -19,7 +19,7 @@ from mcdenoise.scenes.random.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.scenes.random.textures import Color, Rng, texture, wall_color
+from mcdenoise.scenes.random.textures import Color, Rng, log_uniform, texture, wall_color
 
 # A room with more shapes than this gets no more furniture.
 _ENOUGH_SHAPES = 290
@@ -49,8 +49,7 @@ def still_life(rng: Rng) -> SceneBuilder:
         builder.points.append(np.array((x, size / 2, z)))
     light = rng.random()
     if light < 0.45:
-        sun = sun_direction(rng) if rng.random() < 0.7 else None
-        builder.set_sky(sky(rng, float(rng.uniform(0.3, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
+        builder.set_sky(sky(rng, *daylight(rng, 0.7, (0.3, 1), (-0.7, 1.8))))
     elif light < 0.6:
         builder.set_sky(studio(rng, 0.5))
     if light > 0.45:
@@ -100,8 +99,7 @@ def colonnade(rng: Rng) -> SceneBuilder:
         _put_on_floor(builder, rng, [])
     for _ in range(6):
         builder.points.append(rng.uniform(builder.low * (1, 1, 0.9), builder.high * (1, 0.7, 0.9)))
-    sun = sun_direction(rng) if rng.random() < 0.75 else None
-    builder.set_sky(sky(rng, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
+    builder.set_sky(sky(rng, *daylight(rng, 0.75, (0.6, 1.8), (-0.5, 1.8))))
     return builder
 
 
@@ -113,7 +111,7 @@ def light_experiment(rng: Rng) -> SceneBuilder:
     metal = rng.random() < 0.6
     plates, lights = int(rng.integers(3, 6)), int(rng.integers(3, 6))
     for number in range(plates):
-        alpha = float(np.exp(rng.uniform(math.log(0.02), math.log(0.4))))
+        alpha = log_uniform(rng, 0.02, 0.4)
         look = texture(rng) if rng.random() < 0.3 else wall_color(rng)
         material = builder.material(rough_metal("Al", alpha) if metal else _coat(rng, look, alpha))
         angle = 12 + 50 * number / plates
@@ -165,12 +163,7 @@ def _wall_frame(builder: SceneBuilder, wall: int) -> tuple[Array, float, float]:
     """Placement of a wall (+z points into the room, y = 0 is the floor), its length and its height."""
     width, height, depth = builder.high - builder.low
     position = [(0, 0, -depth / 2), (-width / 2, 0, 0), (0, 0, depth / 2), (width / 2, 0, 0)][wall]
-    return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth), float(height)
-
-
-def outwards(wall: int) -> float:
-    """Azimuth of a wall's outward direction, degrees from +z towards +x."""
-    return (180.0, -90.0, 0.0, 90.0)[wall]
+    return place(position, TURNS[wall]), float(width if wall % 2 == 0 else depth), float(height)
 
 
 def closed_wall(builder: SceneBuilder, rng: Rng, wall: int) -> None:
@@ -276,7 +269,7 @@ def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, floa
         turn = float(rng.uniform(0, 360)) if rng.random() < 0.4 else 90 * float(rng.integers(4))
         if rng.random() < 0.6:
             wall = int(rng.integers(4))
-            turn = (0.0, 90.0, 180.0, -90.0)[wall]
+            turn = TURNS[wall]
             x, z = (
                 (x, low[2] + 0.6 * radius),
                 (low[0] + 0.6 * radius, z),

@@ -12,10 +12,10 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
+from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
 from mcdenoise.scenes.random.furniture import glass_block, ornament
 from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, lacquer, mirror, pane, random_metal, rough_plastic
-from mcdenoise.scenes.random.textures import Rng, planks, texture
+from mcdenoise.scenes.random.textures import Rng, log_uniform, planks, texture
 
 # Minimum area in square metres of a floor, a wall or a table top.
 _LARGE = 0.3
@@ -58,14 +58,13 @@ def _coated(rng: Rng, bsdf: Bsdf, large: bool) -> Bsdf:
     if kind < 0.62:
         return lacquer(image, tiling, nonlinear=bool(rng.random() < 0.7))
     if kind < 0.93:
-        alpha = float(np.exp(rng.uniform(math.log(0.01), math.log(0.3))))
-        return rough_plastic(image, alpha, tiling)
+        return rough_plastic(image, log_uniform(rng, 0.01, 0.3), tiling)
     return random_metal(rng)
 
 
 def _contrast(rng: Rng, image: Array) -> Array:
     """Change the contrast of a texture, from nearly none to black and white."""
-    factor = float(np.exp(rng.uniform(math.log(0.12), math.log(3))))
+    factor = log_uniform(rng, 0.12, 3)
     mean = image.mean(axis=(0, 1))
     return np.asarray(np.clip(mean + factor * (image - mean), 0.01, 0.9))
 
@@ -80,7 +79,7 @@ def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
     where[along] += rng.uniform(-0.35, 0.35) * width
     where[across] = (low if wall < 2 else high)[across]
     where[1] = rng.uniform(0.4, 0.6) * height
-    return place(where, (0, 90, 180, -90)[wall]), width, height
+    return place(where, TURNS[wall]), width, height
 
 
 def _wall_mirror(builder: SceneBuilder, rng: Rng) -> Array:

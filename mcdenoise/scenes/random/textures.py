@@ -24,6 +24,11 @@ _PAINTS = {
 }
 
 
+def log_uniform(rng: Rng, low: float, high: float) -> float:
+    """A random number whose logarithm is even."""
+    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+
+
 def random_color(rng: Rng) -> Color:
     """A reflectance: neutral, pastel, saturated, dark or bright."""
     hue = float(rng.random())

@@ -12,7 +12,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, Model, Surface, read_normal_map
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, place
+from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, place
 from mcdenoise.scenes.random.furniture import ornament
 from mcdenoise.scenes.random.lights import bulb, light_color
 from mcdenoise.scenes.random.materials import Bsdf, bitmap, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
@@ -156,7 +156,7 @@ class Floor:
         """A free place at a height: along a wall, facing inwards, or anywhere."""
         for _ in range(14):
             wall = int(rng.integers(4))
-            turn = (0.0, 90.0, 180.0, -90.0)[wall]
+            turn = TURNS[wall]
             along = rng.random() < walls
             if not along and rng.random() < 0.5:
                 turn = float(rng.uniform(0, 360))
@@ -204,7 +204,7 @@ def fill_room(builder: SceneBuilder, rng: Rng, stock: Stock, brightness: float) 
         x = float(rng.uniform(-0.35, 0.35) * side)
         y = min(model.elevation, float(room[1]) - model.size[1] - 0.02)
         deep = float(room[2] if wall % 2 == 0 else room[0]) / 2 - model.size[2] / 2
-        frame = place((0, 0, 0), (0, 90, 180, -90)[wall]) @ place((x, y, -deep))
+        frame = place((0, 0, 0), TURNS[wall]) @ place((x, y, -deep))
         add_model(builder, rng, stock, model, frame, brightness=0.1 * brightness)
 
 

@@ -9,15 +9,14 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh, read_sky
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, box, place, sheet
-from mcdenoise.scenes.random.lights import add_lamps, light_color, scaled, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, box, place, sheet
+from mcdenoise.scenes.random.lights import add_lamps, daylight, light_color, scaled, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import diffuse, glass, random_opaque
 from mcdenoise.scenes.random.rooms import (
     closed_wall,
     colonnade,
     empty_room,
     light_experiment,
-    outwards,
     still_life,
     wall_with_windows,
 )
@@ -105,25 +104,20 @@ def _room(rng: Rng, windows: list[int], glow: Color | None = None) -> tuple[Scen
     return builder, opening
 
 
-def _surface(builder: SceneBuilder) -> float:
-    width, height, depth = builder.high - builder.low
-    return float(2 * (width * height + height * depth + depth * width))
-
-
 def _day(rng: Rng, stock: Stock) -> SceneBuilder:
     """A furnished room lit through its windows."""
     windows = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.4, 0.4, 0.2]))].tolist()
     color = scaled(light_color(rng), 10)
     glow = color if rng.random() < _GLOWING else None
     builder, opening = _room(rng, windows, glow)
-    level = float(np.clip(0.25 * _surface(builder) / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
-    sun = sun_direction(rng, outwards(windows[0])) if rng.random() < 0.65 else None
+    level = float(np.clip(0.25 * builder.surface() / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
+    sun = sun_direction(rng, TURNS[(windows[0] + 2) % 4]) if rng.random() < 0.65 else None
     if glow is None:
         builder.set_sky(any_sky(rng, stock, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     lamps = rng.random() < 0.25
     if lamps:
         add_lamps(builder, rng, int(rng.integers(1, 3)), 0.1)
-    fill_room(builder, rng, stock, 0.1 * _surface(builder) if lamps else 0.0)
+    fill_room(builder, rng, stock, 0.1 * builder.surface() if lamps else 0.0)
     return builder
 
 
@@ -134,7 +128,7 @@ def _evening(rng: Rng, stock: Stock) -> SceneBuilder:
     if windows:
         builder.set_sky(any_sky(rng, stock, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
     add_lamps(builder, rng, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
-    fill_room(builder, rng, stock, 0.5 * _surface(builder))
+    fill_room(builder, rng, stock, 0.5 * builder.surface())
     return builder
 
 
@@ -184,8 +178,7 @@ def _street(rng: Rng, stock: Stock) -> SceneBuilder:
         frame = floor.find(rng, model.size[0], model.size[2], walls=0) if model else None
         if model and frame is not None:
             add_model(builder, rng, stock, model, frame, movable=max(model.size) < 3)
-    sun = sun_direction(rng) if rng.random() < 0.75 else None
-    builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
+    builder.set_sky(any_sky(rng, stock, *daylight(rng, 0.75, (0.6, 1.8), (-0.5, 1.8))))
     return builder
 
 
@@ -211,8 +204,7 @@ def _pool(rng: Rng, stock: Stock) -> SceneBuilder:
     for sign in (-1, 1):
         frame = place((0, 0, sign * (deep / 2 + 0.5)))
         fill_top(builder, rng, stock, frame, 1.5 * wide, 0.8, 0.0, most=6)
-    sun = sun_direction(rng) if rng.random() < 0.6 else None
-    builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1)))))
+    builder.set_sky(any_sky(rng, stock, *daylight(rng, 0.6, (0.6, 1.8), (-0.5, 1))))
     return builder
 
 
