@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any, TypeAlias
 
@@ -16,6 +15,8 @@ from mcdenoise.scenes.random.materials import Bsdf
 from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
+# A shape as in a Mitsuba dictionary, in the coordinates of its group.
+Part: TypeAlias = dict[str, Any]
 
 # Rotation about the vertical axis that turns +z into the room, for each wall: at -z, -x, +z and +x.
 TURNS = (0.0, 90.0, 180.0, -90.0)
@@ -23,46 +24,17 @@ TURNS = (0.0, 90.0, 180.0, -90.0)
 _BOUNDS = {"cylinder": (0, 1), "disk": (0, 0), "rectangle": (0, 0)}
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A shape with its material, in the coordinates of its group.
-
-    Args:
-        kind: a shape plugin of Mitsuba.
-        to_group: ``(4, 4)`` transform from the shape's own space.
-        material: description of a material, or result of :meth:`SceneBuilder.material`.
-        radiance: emitted radiance, if it is a light.
-        mesh: triangles of a part of the kind ``"mesh"``.
-    """
-
-    kind: str
-    to_group: Array
-    material: Bsdf
-    radiance: Color | None = None
-    mesh: Mesh | None = None
-
-    def shape(self, to_world: Array) -> dict[str, Any]:
-        """Its entry in a Mitsuba dictionary, at a place."""
-        shape: dict[str, Any] = {"type": self.kind, "to_world": to_world, "bsdf": self.material}
-        if self.mesh is not None:
-            shape["mesh"] = self.mesh
-        if self.radiance is not None:
-            shape["emitter"] = {"type": "area", "radiance": rgb(self.radiance), "sampling_weight": 1.0}
-        return shape
-
-
 class SceneBuilder:
     """Collects materials, shapes and lights as a Mitsuba dictionary.
 
     ``low`` and ``high`` are the bounds for people and cameras. ``points`` are points of interest for cameras.
-    ``groups`` are the ids of the shapes of each movable object, ``lamps`` those of the emitting shapes.
+    ``groups`` are the ids of the shapes of each movable object.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
         self.low, self.high = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
         self.points: list[Array] = []
         self.groups: list[list[str]] = []
-        self.lamps: list[str] = []
         self._materials: dict[str, Any] = {}
         self._objects: dict[str, Any] = {}
         self._lights: dict[str, Any] = {}
@@ -91,12 +63,10 @@ class SceneBuilder:
         """Add a group of parts to the scene; returns the ids of its shapes."""
         names = []
         for part in parts:
-            matrix = part.to_group if to_world is None else to_world @ part.to_group
-            name = f"{'lamp' if part.radiance else part.kind}_{len(self._objects)}"
-            self._objects[name] = part.shape(matrix)
-            if part.radiance is not None:
-                self.lamps.append(name)
-            self._bounds.append(bounds(part.kind, matrix))
+            matrix = part["to_world"] if to_world is None else to_world @ part["to_world"]
+            name = f"{'lamp' if 'emitter' in part else part['type']}_{len(self._objects)}"
+            self._objects[name] = {**part, "to_world": matrix}
+            self._bounds.append(bounds(part["type"], matrix))
             names.append(name)
         if movable:
             self.groups.append(names)
@@ -115,6 +85,10 @@ class SceneBuilder:
         width, height, depth = self.high - self.low
         return float(2 * (width * height + height * depth + depth * width))
 
+    def lamps(self) -> list[str]:
+        """Ids of the shapes that shine."""
+        return [name for name, shape in self._objects.items() if "emitter" in shape]
+
     def placed(self, name: str) -> Array:
         """Transform of a shape from its own space to world space."""
         return np.asarray(self._objects[name]["to_world"])
@@ -131,7 +105,7 @@ class SceneBuilder:
 
 def scene_of(parts: Mapping[str, Part]) -> dict[str, Any]:
     """The Mitsuba dictionary of named parts, each with a material of its own."""
-    return {"type": "scene"} | {name: _plain(part.shape(part.to_group)) for name, part in parts.items()}
+    return {"type": "scene"} | {name: _plain(part) for name, part in parts.items()}
 
 
 def _plain(value: Any) -> Any:
@@ -147,6 +121,24 @@ def _plain(value: Any) -> Any:
 def rgb(color: Color) -> dict[str, Any]:
     """A colour as a Mitsuba dictionary."""
     return {"type": "rgb", "value": [float(channel) for channel in color]}
+
+
+def shape(kind: str, to_group: Array, material: Bsdf, radiance: Color | None = None, mesh: Mesh | None = None) -> Part:
+    """A shape plugin of Mitsuba, or triangles.
+
+    Args:
+        kind: name of the plugin, or ``"mesh"``.
+        to_group: ``(4, 4)`` transform from the shape's own space.
+        material: description of a material, or result of :meth:`SceneBuilder.material`.
+        radiance: emitted radiance, if it is a light.
+        mesh: triangles of the kind ``"mesh"``.
+    """
+    part: Part = {"type": kind, "to_world": to_group, "bsdf": material}
+    if mesh is not None:
+        part["mesh"] = mesh
+    if radiance is not None:
+        part["emitter"] = {"type": "area", "radiance": rgb(radiance), "sampling_weight": 1.0}
+    return part
 
 
 def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
@@ -175,12 +167,12 @@ def rotate(axis: str, degrees: float) -> Array:
 
 def box(center: Vector, size: Vector, material: Bsdf, turn: float = 0, tilt: float = 0) -> Part:
     """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
-    return Part("cube", place(center, turn, [0.5 * length for length in size], rotate("x", tilt)), material)
+    return shape("cube", place(center, turn, [0.5 * length for length in size], rotate("x", tilt)), material)
 
 
 def ball(center: Vector, radius: float, material: Bsdf, radiance: Color | None = None) -> Part:
     """A sphere."""
-    return Part("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
+    return shape("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
 
 
 def rod(start: Vector, end: Vector, radius: float, material: Bsdf) -> Part:
@@ -193,7 +185,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Bsdf) -> Part:
     first /= np.linalg.norm(first)
     matrix = np.eye(4)
     matrix[:3] = np.stack((first * radius, np.cross(axis, first) * radius, axis * length, np.asarray(start)), axis=1)
-    return Part("cylinder", matrix, material)
+    return shape("cylinder", matrix, material)
 
 
 def drum(foot: Vector, height: float, radius: float, material: Bsdf) -> list[Part]:
@@ -204,11 +196,11 @@ def drum(foot: Vector, height: float, radius: float, material: Bsdf) -> list[Par
 
 def plate(center: Vector, radius: float, material: Bsdf, up: bool = True) -> Part:
     """A horizontal disc."""
-    return Part("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
+    return shape("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
 
 
 def sheet(
     center: Vector, half_size: Vector, material: Bsdf, rotation: Array | None = None, radiance: Color | None = None
 ) -> Part:
     """A rectangle that faces +z before the rotation."""
-    return Part("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)
+    return shape("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)

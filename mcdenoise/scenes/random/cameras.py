@@ -155,7 +155,7 @@ def distance(builder: SceneBuilder, camera: Camera) -> float:
 def movements(builder: SceneBuilder, rng: Rng, frames: int, camera: Camera) -> dict[str, Array]:
     """Let one to three small objects slide, swing or rotate, or let a lamp swing."""
     moves: dict[str, Array] = {}
-    bulbs = [name for name in builder.lamps if _is_small(builder, [name])]
+    bulbs = [name for name in builder.lamps() if _is_small(builder, [name])]
     if bulbs and rng.random() < 0.3:
         moves.update(_motion(builder, rng, frames, [bulbs[int(rng.integers(len(bulbs)))]]))
     groups = [names for names in builder.groups if _is_small(builder, names)]

@@ -12,7 +12,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, Model, Surface, read_normal_map
-from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, place
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, place, shape
 from mcdenoise.scenes.random.furniture import ornament
 from mcdenoise.scenes.random.lights import bulb, light_color
 from mcdenoise.scenes.random.materials import Bsdf, bitmap, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
@@ -102,7 +102,7 @@ def add_model(
         return False
     half = np.array(model.size) / 2 * scale
     box = place((0, float(half[1]), 0), scale=half.tolist())
-    parts = [Part("mesh", box, builder.material(_bsdf(rng, surface)), mesh=mesh) for mesh, surface in found]
+    parts = [shape("mesh", box, builder.material(_bsdf(rng, surface)), mesh=mesh) for mesh, surface in found]
     for lamp in model.lamps if brightness else ():
         radius = max(lamp.diameter / 2 * scale, 0.01)
         center = box[:3, :3] @ np.clip(lamp.center, -1, 1) + box[:3, 3]

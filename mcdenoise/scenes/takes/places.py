@@ -9,7 +9,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh, read_sky
-from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, box, place, sheet
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, box, place, shape, sheet
 from mcdenoise.scenes.random.lights import add_lamps, daylight, light_color, scaled, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import diffuse, glass, random_opaque
 from mcdenoise.scenes.random.rooms import (
@@ -197,7 +197,7 @@ def _pool(rng: Rng, stock: Stock) -> SceneBuilder:
     level = -float(rng.uniform(0.02, 0.15))
     surface = place((0, level, 0), scale=(wide / 2, float(rng.uniform(0.003, 0.02)), deep / 2))
     water = builder.material(glass(1.33))
-    builder.add([Part("mesh", surface, water, mesh=_waves(rng))])
+    builder.add([shape("mesh", surface, water, mesh=_waves(rng))])
     for _ in range(4):
         builder.points.append(rng.uniform((-wide / 3, -depth, -deep / 3), (wide / 3, 0, deep / 3)))
     fill_top(builder, rng, stock, np.eye(4), 0.8 * wide, 0.8 * deep, -depth, most=5)
