@@ -16,9 +16,8 @@ from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine, parse_workers, run_each
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, default_folder, open_assets
-from mcdenoise.scenes.generation import SequencePlan
+from mcdenoise.scenes.generation import Plan, SequencePlan, TakePlan
 from mcdenoise.scenes.render import choose_variant
-from mcdenoise.scenes.takes import Plan, TakePlan
 from mcdenoise.scenes.takes.tracing import stratified
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")

@@ -14,9 +14,9 @@ from mcdenoise.data.camera_path import Camera
 from mcdenoise.data.shards import find_shards, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets
+from mcdenoise.scenes.generation import TakePlan
 from mcdenoise.scenes.random.materials import diffuse, glass
 from mcdenoise.scenes.render.film import Film, curve, offsets, splat
-from mcdenoise.scenes.takes import TakePlan
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 NOTHING = Assets()
@@ -89,7 +89,6 @@ def traced(take: Take) -> tuple[dict[str, Any], Any]:
     from mcdenoise.scenes.takes.tracing import TakeTracer
 
     tracer = TakeTracer(take, "scalar_rgb", half=20)
-    tracer.place(1)
     return tracer.noisy(1), tracer.halves(1)
 
 

@@ -122,7 +122,6 @@ def render_frame(
     Raises:
         InputError: a file cannot be written.
     """
-    tracer.place(number)
     if job.film is None and not job.has(number, 0, job.features):
         found = tracer.features(number)
         write_buffers(job.folder, number, {name: _image(found[name], job.size) for name in job.features})

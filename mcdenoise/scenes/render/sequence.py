@@ -117,7 +117,6 @@ def render_sequence(
             ) from error
     load = partial(SequenceTracer, scene, variant, checked_moves, cameras, size, film, max_depth)
     tracer = load()
-    tracer.place(0)
     away = tracer.features(0)["position"] - cameras[0].to_world[:3, 3]
     scale = float(np.median(np.linalg.norm(away, axis=1)))
     folder = SequenceFolder(

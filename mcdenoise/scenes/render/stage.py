@@ -52,6 +52,7 @@ class Stage:
         self.moves = dict(moves or {})
         self._parameters: Any = mi.traverse(self.scene) if moves else {}
         shapes = {shape.id(): shape for shape in self.scene.shapes()}
+        self._placed: int | None = None
         self._at_rest = {identity: self._placement(identity, shapes) for identity in self.moves}
         self.movers = [identity for identity in self.moves if identity in shapes]
         # Corners of the bounding boxes.
@@ -59,20 +60,22 @@ class Stage:
         self._boxes = {name: np.array([*product(*zip(box.min, box.max, strict=True))]) for name, box in boxes.items()}
 
     def place(self, frame: int) -> None:
-        """Put every moving object to its place in a frame.
+        """Put every moving object to its place in a frame, unless it is there.
 
         Raises:
             InputError: Mitsuba cannot apply the transform to an object.
         """
+        if not self._at_rest or frame == self._placed:
+            return
         for identity, placement in self._at_rest.items():
             matrix = self.moves[identity][frame]
             for key, (kind, value) in placement.items():
                 self._parameters[f"{identity}.{key}"] = kind(*_transformed(key, value, matrix))
-        if self._at_rest:
-            try:
-                self._parameters.update()
-            except RuntimeError as error:
-                raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {first_line(error)}") from error
+        try:
+            self._parameters.update()
+        except RuntimeError as error:
+            raise InputError(f"frame {frame}: Mitsuba cannot move the objects: {first_line(error)}") from error
+        self._placed = frame
 
     def reach(self, cameras: Sequence[Camera]) -> float:
         """A distance from each camera that is behind everything in the scene: the distance of the background."""
