@@ -166,7 +166,7 @@ def render_sequence(
             progress(min(done, total), total)
 
     advance(0)
-    missing = [number for number in range(count) if not job.is_finished(number)]
+    missing = [number for number in range(count) if left[number] or not job.has(number, 0, job.features)]
     if engine is None:
         for number in missing:
             folder.note_reference(number, render_frame(job, tracer, number, advance))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.render.film import Film, offsets, splat
-from mcdenoise.scenes.render.stage import Stage, to_previous
+from mcdenoise.scenes.render.loading import Stage, to_previous
 
 # Samples traced at once: enough to fill the vector units, small enough for a laptop's memory.
 WAVEFRONT = 2**22

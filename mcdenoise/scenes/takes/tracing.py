@@ -10,7 +10,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.materials import METALS
-from mcdenoise.scenes.render.stage import Stage
+from mcdenoise.scenes.render.loading import Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, DEPTH, HIT, NORMAL, REST, Samples, Tracer
 from mcdenoise.scenes.takes.draw import Take
 
@@ -32,7 +32,7 @@ class TakeTracer(Tracer):
         half: samples a pixel of each half of a reference.
 
     Raises:
-        InputError: see :class:`mcdenoise.scenes.render.stage.Stage`.
+        InputError: see :class:`mcdenoise.scenes.render.loading.Stage`.
     """
 
     # No light of a scene is as bright by far: such a sample is an error of rounding, and one would spoil a reference.
