@@ -59,8 +59,8 @@ class SceneBuilder:
         """Replace every material by the result of ``change`` for its id and description."""
         self._materials = {name: change(name, bsdf) for name, bsdf in self._materials.items()}
 
-    def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> list[str]:
-        """Add a group of parts to the scene; returns the ids of its shapes."""
+    def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> None:
+        """Add a group of parts to the scene."""
         names = []
         for part in parts:
             matrix = part["to_world"] if to_world is None else to_world @ part["to_world"]
@@ -70,7 +70,6 @@ class SceneBuilder:
             names.append(name)
         if movable:
             self.groups.append(names)
-        return names
 
     def add_light(self, light: dict[str, Any]) -> None:
         """Add a light without a surface: a point or spot light."""

@@ -122,9 +122,8 @@ def light_experiment(rng: Rng) -> SceneBuilder:
     for number, radius in enumerate(np.geomspace(0.02, 0.35, lights)):
         x = (number - (lights - 1) / 2) * 3.4 / lights
         power = 6 * float(np.exp(rng.uniform(-0.7, 0.7))) / lights
-        radiance = np.array(wall_color(rng)) * power / (math.pi * radius**2)
-        glow = (float(radiance[0]), float(radiance[1]), float(radiance[2]))
-        builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), float(radius), black, glow)], movable=True)
+        red, green, blue = (channel * power / (math.pi * radius**2) for channel in wall_color(rng))
+        builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), radius, black, (red, green, blue))], movable=True)
     # Without this light the far corners would be black.
     builder.set_sky(studio(rng, float(rng.uniform(0.03, 0.2))))
     for _ in range(int(rng.integers(1, 5))):
@@ -154,7 +153,7 @@ def empty_room(rng: Rng) -> SceneBuilder:
         builder.add([rod((x, 0, z), (x, height, z), rng.uniform(0.06, 0.2), pillar)])
     if rng.random() < 0.5:
         rug = builder.material(random_opaque(rng, textured=0.95))
-        where = (*(rng.uniform(-0.15, 0.15, 1) * width), 0.006, 0.0)
+        where = (rng.uniform(-0.15, 0.15) * width, 0.006, 0)
         builder.add([box(where, (width * rng.uniform(0.3, 0.7), 0.012, depth * rng.uniform(0.3, 0.6)), rug)])
     return builder
 
@@ -262,34 +261,25 @@ def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, floa
     low, high = builder.low, builder.high
     parts, radius, top = furniture(builder, rng, float(high[1]))
     for _ in range(12):
-        x, z = (
-            float(rng.uniform(low[axis] + radius, max(high[axis] - radius, low[axis] + radius + 0.01)))
-            for axis in (0, 2)
-        )
+        lowest = low + radius
+        x, z = (rng.uniform(lowest[axis], max(high[axis] - radius, lowest[axis] + 0.01)) for axis in (0, 2))
         turn = float(rng.uniform(0, 360)) if rng.random() < 0.4 else 90 * float(rng.integers(4))
         if rng.random() < 0.6:
             wall = int(rng.integers(4))
             turn = TURNS[wall]
-            x, z = (
-                (x, low[2] + 0.6 * radius),
-                (low[0] + 0.6 * radius, z),
-                (x, high[2] - 0.6 * radius),
-                (high[0] - 0.6 * radius, z),
-            )[wall]
+            first, last = low + 0.6 * radius, high - 0.6 * radius
+            x, z = ((x, first[2]), (first[0], z), (x, last[2]), (last[0], z))[wall]
         if all(math.hypot(x - a, z - b) > radius + c for a, b, c in taken):
             taken.append((x, z, radius))
-            names = builder.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
-            lows, highs = builder.boxes()
-            middle = (lows[-len(names) :].min(axis=0) + highs[-len(names) :].max(axis=0)) / 2
-            builder.points.append(middle)
+            builder.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
+            lows, highs = (corners[-len(parts) :] for corners in builder.boxes())
+            builder.points.append((lows.min(axis=0) + highs.max(axis=0)) / 2)
             if top > 0:
                 decorate(builder, rng, (x, top, z), 0.6 * radius, int(rng.integers(1, 5)))
             return
 
 
-def _coat(
-    rng: Rng, look: tuple[float, float, float] | Array, alpha: float = 0.0, repeat: tuple[float, float] = (1, 1)
-) -> Bsdf:
+def _coat(rng: Rng, look: Color | Array, alpha: float = 0.0, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
     """Paint for walls: diffuse, or glossy with the given roughness."""
     if alpha == 0 and rng.random() < 0.7:
         return diffuse(look, repeat)

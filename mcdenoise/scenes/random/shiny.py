@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import TURNS, Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
 from mcdenoise.scenes.random.furniture import glass_block, ornament
 from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, lacquer, mirror, pane, random_metal, rough_plastic
 from mcdenoise.scenes.random.textures import Rng, log_uniform, planks, texture
@@ -124,22 +124,19 @@ def _standing_pane(builder: SceneBuilder, rng: Rng) -> Array:
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
     wide, tall = rng.uniform(0.4, 1.2), rng.uniform(0.5, 1.0) * min(float(builder.high[1]) - 0.1, 1.9)
     rim = builder.material(random_metal(rng))
-    parts: list[Part] = []
     if rng.random() < 0.7:
-        parts.append(sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane())))
+        filling = sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane()))
     else:
-        parts.append(box((0, tall / 2, 0), (wide, tall, 0.03), builder.material(glass())))
-    for side in (-1, 1):
-        parts.append(rod((side * wide / 2, 0, 0), (side * wide / 2, tall, 0), 0.015, rim))
-    builder.add(parts, place(where, turn))
+        filling = box((0, tall / 2, 0), (wide, tall, 0.03), builder.material(glass()))
+    posts = [rod((x, 0, 0), (x, tall, 0), 0.015, rim) for x in (-wide / 2, wide / 2)]
+    builder.add([filling, *posts], place(where, turn))
     return np.asarray(where + np.array((0, tall / 2, 0)))
 
 
 def _vitrine(builder: SceneBuilder, rng: Rng) -> Array:
     """Ornaments on a block under a glass box."""
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
-    edge, base = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.05, 0.8))
-    base = min(base, 0.4 * float(builder.high[1]))
+    edge, base = rng.uniform(0.3, 0.7), min(rng.uniform(0.05, 0.8), 0.4 * builder.high[1])
     block = builder.material(_coated(rng, diffuse(texture(rng)), large=True))
     clear = builder.material(pane())
     parts = [box((0, base / 2, 0), (edge, base, edge), block)]
@@ -157,18 +154,16 @@ def _vitrine(builder: SceneBuilder, rng: Rng) -> Array:
 def _jewels(builder: SceneBuilder, rng: Rng) -> Array:
     """Balls, cylinders and blocks of glass, mirror and metal next to each other on a glossy plate."""
     where = _spot(builder, rng)
-    radius, height = float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.02, 0.7))
-    height = min(height, 0.4 * float(builder.high[1]))
+    radius, height = rng.uniform(0.3, 0.6), min(rng.uniform(0.02, 0.7), 0.4 * builder.high[1])
     plate = builder.material(_coated(rng, diffuse(texture(rng)), large=True))
     frame = place(where, float(rng.uniform(0, 360)))
     builder.add(drum((0, 0, 0), height, radius, plate), frame)
     count = int(rng.integers(3, 7))
     for number in range(count):
         angle = 2 * math.pi * number / count
-        size = float(rng.uniform(0.1, 0.35)) * radius * 2
+        size = rng.uniform(0.1, 0.35) * radius * 2
         spot = frame @ place((0.62 * radius * math.cos(angle), height + 0.002, 0.62 * radius * math.sin(angle)))
         kind = rng.random()
-        parts: list[Part]
         if kind < 0.35:
             parts = glass_block(builder, rng, size)
         else:
@@ -186,8 +181,7 @@ def _jewels(builder: SceneBuilder, rng: Rng) -> Array:
 def _lacquered_box(builder: SceneBuilder, rng: Rng) -> Array:
     """A chest or a low table of dark lacquered wood that reflects the objects on it."""
     where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
-    wide, deep, tall = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.0), rng.uniform(0.1, 0.7)
-    tall = min(float(tall), 0.4 * float(builder.high[1]))
+    wide, deep, tall = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.0), min(rng.uniform(0.1, 0.7), 0.4 * builder.high[1])
     wood = planks(rng) if rng.random() < 0.7 else texture(rng)
     dark = np.clip(wood * rng.uniform(0.05, 0.5), 0.003, 0.9)
     tiling = (float(rng.integers(1, 4)), float(rng.integers(1, 4)))
