@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +119,5 @@ def _cube() -> Mesh:
 
 def of_triangles(mesh: assets.Mesh) -> Mesh:
     """The triangles of a model, with texture coordinates as Mitsuba has them, whose images begin at the top."""
-    uv: NDArray[Any] = np.zeros((len(mesh.vertices), 2)) if mesh.uv is None else mesh.uv * (1, -1) + (0, 1)
-    smooth = mesh.normals is not None
-    return Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64), uv[mesh.faces], smooth)
+    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    return Mesh(vertices, faces, mesh.texcoords[mesh.faces], smooth=mesh.normals is not None)

@@ -141,22 +141,24 @@ class _Translator:
         ior = float(bsdf.get("int_ior", _PLASTIC_IOR if "plastic" in kind else _GLASS_IOR))
         if kind == "thindielectric":
             return {"pane": ior}
-        makers = {"diffuse": self._diffuse, "plastic": self._plastic, "conductor": self._metal}
-        makers |= {"roughplastic": self._plastic, "roughconductor": self._metal, "dielectric": self._glass}
-        if kind not in makers:
-            raise InputError(f"expected a material that Cycles can be given ({', '.join(makers)}), found '{kind}'")
-        return {"inputs": {**_DIFFUSE, **makers[kind](bsdf, ior)}}
+        return {"inputs": {**_DIFFUSE, **self._inputs(bsdf, ior)}}
 
-    def _diffuse(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        return {"Base Color": self._value(bsdf["reflectance"])}
-
-    def _plastic(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        base, roughness = {"Base Color": self._value(bsdf["diffuse_reflectance"])}, math.sqrt(bsdf.get("alpha", 0))
-        if self._rng.random() < 0.5:
-            return base | {"Roughness": roughness, "Specular IOR Level": 0.5, "IOR": ior}
-        return base | {"Coat Weight": 1.0, "Coat Roughness": roughness, "Coat IOR": ior}
-
-    def _metal(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
+    def _inputs(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
+        """Inputs of a Principled shader where they are not those of a diffuse one."""
+        kind = bsdf["type"]
+        if kind == "diffuse":
+            return {"Base Color": self._value(bsdf["reflectance"])}
+        if kind == "dielectric":
+            inputs = {"Base Color": [1.0] * 3, "Transmission Weight": 1.0, "Roughness": 0.0}
+            return inputs | {"Specular IOR Level": 0.5, "IOR": ior}
+        if kind in ("plastic", "roughplastic"):
+            base, roughness = {"Base Color": self._value(bsdf["diffuse_reflectance"])}, math.sqrt(bsdf.get("alpha", 0))
+            if self._rng.random() < 0.5:
+                return base | {"Roughness": roughness, "Specular IOR Level": 0.5, "IOR": ior}
+            return base | {"Coat Weight": 1.0, "Coat Roughness": roughness, "Coat IOR": ior}
+        if kind not in ("conductor", "roughconductor"):
+            known = "diffuse, dielectric, plastic, roughplastic, conductor, roughconductor"
+            raise InputError(f"expected a material that Cycles can be given ({known}), found '{kind}'")
         metal, tint = np.array(METALS[bsdf["material"]]), bsdf.get("specular_reflectance", 1.0)
         if isinstance(tint, Mapping) and tint["type"] == "bitmap":
             tint = {**tint, "bitmap": np.asarray(tint["bitmap"]) * metal}
@@ -166,10 +168,6 @@ class _Translator:
         # Artists' roughness is the square root of GGX's alpha.
         rough = {**alpha, "bitmap": np.sqrt(alpha["bitmap"])} if isinstance(alpha, Mapping) else math.sqrt(alpha)
         return {"Base Color": self._value(tint), "Metallic": 1.0, "Roughness": self._value(rough)}
-
-    def _glass(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        inputs = {"Base Color": [1.0] * 3, "Transmission Weight": 1.0, "Roughness": 0.0}
-        return inputs | {"Specular IOR Level": 0.5, "IOR": ior}
 
     def _value(self, value: Any) -> Any:
         """A number or a color as three numbers, or a texture: ``{"texture": name, "scale": [u, v]}``."""

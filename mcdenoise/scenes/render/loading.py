@@ -288,10 +288,8 @@ def _to_mitsuba(mi: Any, value: Any, folder: Path, name: str = "") -> Any:
 
 def _write_ply(mi: Any, path: Path, mesh: Mesh, to_world: Array) -> None:
     """Write a mesh in its place."""
-    # Mitsuba's images begin at the top.
-    uv = np.zeros((len(mesh.vertices), 2)) if mesh.uv is None else mesh.uv * (1, -1) + (0, 1)
     positions = mesh.vertices @ to_world[:3, :3].T + to_world[:3, 3]
-    columns: dict[str, NDArray[Any]] = {"vertex_positions": positions, "vertex_texcoords": uv}
+    columns: dict[str, NDArray[Any]] = {"vertex_positions": positions, "vertex_texcoords": mesh.texcoords}
     if mesh.normals is not None:
         normals = mesh.normals @ np.linalg.inv(to_world[:3, :3])
         columns["vertex_normals"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
