@@ -15,7 +15,7 @@ from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine, parse_workers, run_each
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.assets import Assets, default_folder, open_assets
+from mcdenoise.scenes.assets import Assets, open_assets
 from mcdenoise.scenes.generation import Plan, SequencePlan, TakePlan
 from mcdenoise.scenes.render import choose_variant
 from mcdenoise.scenes.takes.tracing import stratified
@@ -114,7 +114,7 @@ def generate(
 def _opened(folder: str | None) -> Assets:
     if folder == _NO_ASSETS:
         return Assets()
-    return open_assets(default_folder() if folder is None else Path(folder), lambda line: warn([line]))
+    return open_assets(None if folder is None else Path(folder), lambda line: warn([line]))
 
 
 def _of_takes(rendering: RenderOptions, frames: int | None) -> dict[str, Any]:

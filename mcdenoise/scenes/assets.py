@@ -180,21 +180,17 @@ class Assets:
         return f"{path.stem} ({_CREDITS[path.suffix]}, by @pmndrs/assets, CC0 1.0)"
 
 
-def default_folder() -> Path:
-    """The folder in the user's cache."""
-    return cache_file("assets")
-
-
-def open_assets(folder: Path, say: Callable[[str], None]) -> Assets:
+def open_assets(folder: Path | None, say: Callable[[str], None]) -> Assets:
     """The assets in a folder; packages that are not there are fetched, and one line says what is missing.
 
     Args:
-        folder: created if necessary.
+        folder: created if necessary; by default one in the user's cache.
         say: shows one line.
 
     Raises:
         InputError: the folder cannot be written, or an archive in it is damaged.
     """
+    folder = folder or cache_file("assets")
     make_folder(folder)
     furniture, images = folder / _FURNITURE, folder / "images"
     for target, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):

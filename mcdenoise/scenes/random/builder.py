@@ -59,8 +59,17 @@ class SceneBuilder:
         """Replace every material by the result of ``change`` for its id and description."""
         self._materials = {name: change(name, bsdf) for name, bsdf in self._materials.items()}
 
-    def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> None:
-        """Add a group of parts to the scene."""
+    def add(
+        self, parts: Iterable[Part], to_world: Array | None = None, *, movable: bool = False, look: Vector | None = None
+    ) -> None:
+        """Add a group of parts to the scene.
+
+        Args:
+            parts: shapes in the coordinates of the group.
+            to_world: ``(4, 4)`` place of the group.
+            movable: whether it may move.
+            look: a point of interest, in the coordinates of the group.
+        """
         names = []
         for part in parts:
             matrix = part["to_world"] if to_world is None else to_world @ part["to_world"]
@@ -70,6 +79,8 @@ class SceneBuilder:
             names.append(name)
         if movable:
             self.groups.append(names)
+        if look is not None:
+            self.points.append(np.array(look) if to_world is None else (to_world @ (*look, 1.0))[:3])
 
     def add_light(self, light: dict[str, Any]) -> None:
         """Add a light without a surface: a point or spot light."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +32,7 @@ def shoot(builder: SceneBuilder, rng: Rng, frames: int) -> list[Camera]:
     best: tuple[float, list[_View]] = (-1.0, [])
     for _ in range(_TRIES):
         start = _propose(builder, rng)
-        views = [start] * (_HORIZON + 1)
-        if moving:
-            path = _way_to_move(start, rng)
-            views = [path(frame) for frame in range(_HORIZON + 1)]
+        views = _moved(start, rng) if moving else [start] * (_HORIZON + 1)
         score = 0.0
         if _is_free(builder, boxes, views):
             score = min(_score(boxes, views[frame]) for frame in (0, _HORIZON // 2, _HORIZON))
@@ -56,7 +52,7 @@ def _propose(builder: SceneBuilder, rng: Rng) -> _View:
         origin[1] = np.clip(rng.normal(1.35, 0.3), low[1], high[1])
     points = builder.points or [(low + high) / 2]
     target = points[int(rng.integers(len(points)))] + rng.normal(0, 0.15, 3)
-    fov = float(rng.uniform(45, 75) if rng.random() < 0.6 else rng.uniform(20, 45))
+    fov = rng.uniform(45, 75) if rng.random() < 0.6 else rng.uniform(20, 45)
     return _View(origin, target, fov)
 
 
@@ -99,8 +95,8 @@ def _score(boxes: tuple[Array, Array], view: _View) -> float:
     )
 
 
-def _way_to_move(view: _View, rng: Rng) -> Callable[[int], _View]:
-    """A movement of 0.3 to 12 pixels per frame in an image 256 pixels wide."""
+def _moved(view: _View, rng: Rng) -> list[_View]:
+    """A path with a movement of 0.3 to 12 pixels per frame in an image 256 pixels wide."""
     speed = log_uniform(rng, 0.3, 12)
     angle = math.radians(view.fov_x) / 256 * speed
     forward = view.target - view.origin
@@ -133,7 +129,7 @@ def _way_to_move(view: _View, rng: Rng) -> Callable[[int], _View]:
             origin, target = origin + frame * drift, target + 0.3 * frame * np.roll(drift, 1)
         return _View(origin, target + shift, view.fov_x)
 
-    return move
+    return [move(frame) for frame in range(_HORIZON + 1)]
 
 
 def _turned(vector: Array, angle: float) -> Array:

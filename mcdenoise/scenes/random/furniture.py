@@ -67,21 +67,21 @@ def decorate(builder: SceneBuilder, rng: Rng, center: tuple[float, float, float]
     """Put ornaments onto a surface without overlap."""
     taken: list[tuple[float, float, float]] = []
     for _ in range(3 * count):
-        size = float(rng.uniform(0.15, 0.5)) * min(radius, 1.0)
+        size = rng.uniform(0.15, 0.5) * min(radius, 1.0)
         angle, away = rng.uniform(0, 2 * math.pi), (radius - size / 2) * math.sqrt(rng.random()) * 0.85
         x, z = center[0] + away * math.cos(angle), center[2] + away * math.sin(angle)
         if any(math.hypot(x - a, z - b) < 0.5 * (size + c) for a, b, c in taken):
             continue
         taken.append((x, z, size))
-        builder.add(ornament(builder, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
-        builder.points.append(np.array((x, center[1] + 0.5 * size, z)))
+        parts, frame = ornament(builder, rng, size), place((x, center[1], z), rng.uniform(0, 360))
+        builder.add(parts, frame, movable=True, look=(0, 0.5 * size, 0))
         if len(taken) == count:
             return
 
 
 def glass_block(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     """A solid piece of glass that causes caustics."""
-    material = builder.material(glass(float(rng.uniform(1.4, 1.7))))
+    material = builder.material(glass(rng.uniform(1.4, 1.7)))
     if rng.random() < 0.6:
         return [ball((0, size / 2, 0), size / 2, material)]
     return [box((0, size / 2, 0), (size * 0.6, size, size * 0.6), material, rng.uniform(0, 90))]

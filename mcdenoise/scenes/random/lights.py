@@ -117,7 +117,7 @@ def add_lamps(builder: SceneBuilder, rng: Rng, count: int, brightness: float) ->
     flux = brightness * math.pi * builder.surface() * 0.5
     for fraction in rng.dirichlet(np.full(count, 1.5)):
         kind = rng.choice(list(_LAMPS), p=[chance for _, chance in _LAMPS.values()])
-        x, z = (float(rng.uniform(low[axis] + 0.15 * s, high[axis] - 0.15 * s)) for axis, s in ((0, width), (2, depth)))
+        x, z = (rng.uniform(low[axis] + 0.15 * s, high[axis] - 0.15 * s) for axis, s in ((0, width), (2, depth)))
         _LAMPS[kind][0](builder, rng, (x, float(high[1]), z), float(flux * fraction), light_color(rng))
 
 
@@ -128,7 +128,7 @@ def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power
     if rng.random() < 0.4:
         builder.add([bulb(origin, size / 2, black, power, color)])
         return
-    half_size = (size, size * float(rng.uniform(0.3, 1)))
+    half_size = (size, size * rng.uniform(0.3, 1))
     builder.add([_glowing(origin, half_size, black, power, color, _facing(origin, target, (0.0, 1.0, 0.0)))])
 
 
@@ -167,8 +167,9 @@ def _pendant(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: 
     radius = log_uniform(rng, 0.02, 0.2)
     y = ceiling - rng.uniform(0.15, 0.45) * float(ceiling - builder.low[1])
     cord = builder.material(diffuse((0.05, 0.05, 0.05)))
-    builder.add([rod((x, y + radius, z), hook, 0.006, cord), bulb((x, y, z), radius, cord, power, color)])
-    builder.points.append(np.array((x, y, z)))
+    builder.add(
+        [rod((x, y + radius, z), hook, 0.006, cord), bulb((x, y, z), radius, cord, power, color)], look=(x, y, z)
+    )
     if rng.random() < 0.4:
         shade = builder.material(random_opaque(rng))
         wide, top = radius * rng.uniform(1.3, 2.5), (x, y + 1.5 * radius, z)
@@ -181,8 +182,7 @@ def _standing(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color:
     top = y + rng.uniform(0.35, 0.7) * float(hook[1] - y)
     radius = rng.uniform(0.04, 0.15)
     builder.add([*drum((x, y, z), 0.03, 0.15, metal), rod((x, y, z), (x, top - radius, z), 0.015, metal)])
-    builder.add([bulb((x, top, z), radius, metal, power, color)])
-    builder.points.append(np.array((x, top, z)))
+    builder.add([bulb((x, top, z), radius, metal, power, color)], look=(x, top, z))
     if rng.random() < 0.5:
         shade = builder.material(random_opaque(rng))
         builder.add([rod((x, top - 1.4 * radius, z), (x, top + 1.4 * radius, z), 1.8 * radius, shade)])
@@ -205,12 +205,11 @@ def _chandelier(builder: SceneBuilder, rng: Rng, hook: Point, power: float, colo
     metal = builder.material(random_metal(rng))
     bulbs, radius = 3, rng.uniform(0.2, 0.5)
     middle = (hook[0], hook[1] - rng.uniform(0.4, 0.8), hook[2])
-    builder.add([rod(middle, hook, 0.012, metal)])
+    builder.add([rod(middle, hook, 0.012, metal)], look=middle)
     for number in range(bulbs):
         angle = 2 * math.pi * number / bulbs
         x, y, z = hook[0] + radius * math.cos(angle), middle[1] + 0.08, hook[2] + radius * math.sin(angle)
         builder.add([rod(middle, (x, y, z), 0.01, metal), bulb((x, y + 0.05, z), 0.04, metal, power / bulbs, color)])
-    builder.points.append(np.array(middle))
 
 
 def _spot(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color, *, narrow: bool = True) -> None:

@@ -97,7 +97,7 @@ def random_material(rng: Rng) -> Bsdf:
         return random_metal(rng)
     if kind < 0.88:
         return mirror(str(rng.choice(list(METALS))))
-    return glass(float(rng.uniform(1.3, 1.75)))
+    return glass(rng.uniform(1.3, 1.75))
 
 
 def _two_sided(bsdf: Bsdf) -> Bsdf:

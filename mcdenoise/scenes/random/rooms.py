@@ -41,12 +41,11 @@ def still_life(rng: Rng) -> SceneBuilder:
         if rng.random() < 0.5:
             builder.add([box((-1.9, 1.5, 0), (0.1, 3.2, 6), builder.material(random_opaque(rng, (2, 1))))])
             builder.low[0] = -1.8
-    decorate(builder, rng, (0, 0, 0), float(rng.uniform(0.6, 1.1)), int(rng.integers(6, 16)))
+    decorate(builder, rng, (0, 0, 0), rng.uniform(0.6, 1.1), int(rng.integers(6, 16)))
     for _ in range(int(rng.integers(0, 4))):
-        size = float(rng.uniform(0.15, 0.6))
+        size = rng.uniform(0.15, 0.6)
         x, z = rng.uniform(-0.7, 0.7, 2)
-        builder.add(glass_block(builder, rng, size), place((x, 0, z)), movable=True)
-        builder.points.append(np.array((x, size / 2, z)))
+        builder.add(glass_block(builder, rng, size), place((x, 0, z)), movable=True, look=(0, size / 2, 0))
     light = rng.random()
     if light < 0.45:
         builder.set_sky(sky(rng, *daylight(rng, 0.7, (0.3, 1), (-0.7, 1.8))))
@@ -57,7 +56,7 @@ def still_life(rng: Rng) -> SceneBuilder:
         for _ in range(lights):
             angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(0.8, 2.0)
             origin = np.array((away * math.cos(angle), rng.uniform(0.8, 2.4), away * math.sin(angle)))
-            softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(8, 40)) / lights)
+            softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), rng.uniform(8, 40) / lights)
     return builder
 
 
@@ -116,8 +115,7 @@ def light_experiment(rng: Rng) -> SceneBuilder:
         material = builder.material(rough_metal("Al", alpha) if metal else _coat(rng, look, alpha))
         angle = 12 + 50 * number / plates
         center = (0, 0.15 + 0.7 * (1 - math.cos(math.radians(angle))) * 1.6, 0.9 - 0.55 * number)
-        builder.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)])
-        builder.points.append(np.array(center))
+        builder.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)], look=center)
     black = builder.material(diffuse((0.02, 0.02, 0.02)))
     for number, radius in enumerate(np.geomspace(0.02, 0.35, lights)):
         x = (number - (lights - 1) / 2) * 3.4 / lights
@@ -125,7 +123,7 @@ def light_experiment(rng: Rng) -> SceneBuilder:
         red, green, blue = (channel * power / (math.pi * radius**2) for channel in wall_color(rng))
         builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), radius, black, (red, green, blue))], movable=True)
     # Without this light the far corners would be black.
-    builder.set_sky(studio(rng, float(rng.uniform(0.03, 0.2))))
+    builder.set_sky(studio(rng, rng.uniform(0.03, 0.2)))
     for _ in range(int(rng.integers(1, 5))):
         where = (rng.uniform(-1.8, 1.8), 0, rng.uniform(1.2, 2.2))
         builder.add(ornament(builder, rng, rng.uniform(0.2, 0.5)), place(where, rng.uniform(0, 360)), movable=True)
@@ -182,8 +180,7 @@ def closed_wall(builder: SceneBuilder, rng: Rng, wall: int) -> None:
     builder.add(parts, frame)
     for _ in range(int(rng.integers(0, 4))):
         where = place((rng.uniform(-0.4, 0.4) * length, rng.uniform(0.45, 0.75) * height, 0.0))
-        builder.add(picture_frame(builder, rng), frame @ where)
-        builder.points.append((frame @ where)[:3, 3])
+        builder.add(picture_frame(builder, rng), frame @ where, look=(0, 0, 0))
 
 
 def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | None = None) -> float:
@@ -198,9 +195,9 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | 
     frame, length, height = _wall_frame(builder, wall)
     count = int(rng.integers(1, 4)) if length > 3 else 1
     sill = float(rng.choice([0.0, rng.uniform(0.3, 1.1)], p=[0.2, 0.8]))
-    top = float(rng.uniform(0.75, 0.95)) * height
+    top = rng.uniform(0.75, 0.95) * height
     pitch = length / count
-    wide = pitch * float(rng.uniform(0.25, 0.85))
+    wide = pitch * rng.uniform(0.25, 0.85)
     surface = builder.material(_coat(rng, wall_color(rng)))
     bar = builder.material(diffuse(wall_color(rng)))
     over = height - top
@@ -230,15 +227,14 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | 
             parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane())))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
-            tilt, slat = float(rng.uniform(-50, 50)), (wide, 0.004, tall / slats * 0.9)
+            tilt, slat = rng.uniform(-50, 50), (wide, 0.004, tall / slats * 0.9)
             parts += [box((x, sill + tall * (n + 0.5) / slats, -0.05), slat, bar, 0, tilt) for n in range(slats)]
         elif dressing == "curtains":
-            part = wide * float(rng.uniform(0.2, 0.45))
+            part = wide * rng.uniform(0.2, 0.45)
             for side in (-1, 1):
                 hook = place((x + side * (wide - part) / 2, top + 0.1, 0.12))
                 builder.add(curtain(builder, rng, part, top if rng.random() < 0.5 else tall + 0.2), frame @ hook)
-    builder.add(parts, frame)
-    builder.points.append((frame @ np.array((middles[0], (sill + top) / 2, 0.3, 1.0)))[:3])
+    builder.add(parts, frame, look=(middles[0], (sill + top) / 2, 0.3))
     return count * wide * (top - sill) * (0.5 if dressing != "none" else 1)
 
 
@@ -263,7 +259,7 @@ def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, floa
     for _ in range(12):
         lowest = low + radius
         x, z = (rng.uniform(lowest[axis], max(high[axis] - radius, lowest[axis] + 0.01)) for axis in (0, 2))
-        turn = float(rng.uniform(0, 360)) if rng.random() < 0.4 else 90 * float(rng.integers(4))
+        turn = rng.uniform(0, 360) if rng.random() < 0.4 else 90 * float(rng.integers(4))
         if rng.random() < 0.6:
             wall = int(rng.integers(4))
             turn = TURNS[wall]
@@ -283,4 +279,4 @@ def _coat(rng: Rng, look: Color | Array, alpha: float = 0.0, repeat: tuple[float
     """Paint for walls: diffuse, or glossy with the given roughness."""
     if alpha == 0 and rng.random() < 0.7:
         return diffuse(look, repeat)
-    return rough_plastic(look, alpha or float(rng.uniform(0.1, 0.4)), repeat)
+    return rough_plastic(look, alpha or rng.uniform(0.1, 0.4), repeat)

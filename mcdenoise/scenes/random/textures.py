@@ -31,7 +31,7 @@ def log_uniform(rng: Rng, low: float, high: float) -> float:
 
 def random_color(rng: Rng) -> Color:
     """A reflectance: neutral, pastel, saturated, dark or bright."""
-    hue = float(rng.random())
+    hue = rng.random()
     kind = str(rng.choice(list(_PAINTS), p=[chance for chance, _, _ in _PAINTS.values()]))
     if kind == "wood":
         hue = rng.uniform(0.04, 0.11)
@@ -44,7 +44,7 @@ def wall_color(rng: Rng) -> Color:
     """A bright paint in most cases, for indirect light; sometimes any color."""
     if rng.random() < 0.25:
         return random_color(rng)
-    red, green, blue = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0, 0.25)), rng.uniform(0.5, 0.88))
+    red, green, blue = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0, 0.25), rng.uniform(0.5, 0.88))
     return red, green, blue
 
 

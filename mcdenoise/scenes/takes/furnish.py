@@ -108,10 +108,9 @@ def add_model(
         center = box[:3, :3] @ np.clip(lamp.center, -1, 1) + box[:3, 3]
         color, black = light_color(rng), builder.material(diffuse((0.02, 0.02, 0.02)))
         parts.append(bulb(center, radius, black, brightness / len(model.lamps), color))
-    builder.add(parts, frame, movable=movable)
+    builder.add(parts, frame, movable=movable, look=(0, half[1], 0))
     stock.credits.add(f"{model.name} ({model.credit})")
     stock.triangles += sum(len(mesh.faces) for mesh, _ in found)
-    builder.points.append((frame @ np.array((0, half[1], 0, 1)))[:3])
     return True
 
 
@@ -131,7 +130,7 @@ def _bsdf(rng: Rng, surface: Surface) -> Bsdf:
     if change < 0.12:
         return random_metal(rng)
     if surface.shine > 0.04 or change > 0.8:
-        alpha = math.sqrt(2 / (max(surface.exponent, 1) + 2)) * float(rng.uniform(0.4, 1))
+        alpha = math.sqrt(2 / (max(surface.exponent, 1) + 2)) * rng.uniform(0.4, 1)
         return rough_plastic(image, float(np.clip(alpha, 0.02, 0.45)))
     return diffuse(image)
 
@@ -159,7 +158,7 @@ class Floor:
             turn = TURNS[wall]
             along = rng.random() < walls
             if not along and rng.random() < 0.5:
-                turn = float(rng.uniform(0, 360))
+                turn = rng.uniform(0, 360)
             c, s = abs(math.cos(math.radians(turn))), abs(math.sin(math.radians(turn)))
             half = np.array((c * width + s * depth, s * width + c * depth)) / 2
             low, high = self.low[[0, 2]] + half + 0.02, self.high[[0, 2]] - half - 0.02
@@ -216,15 +215,13 @@ def fill_top(
     surface, small = Floor(-half, half), stock.small()
     for _ in range(int(rng.integers(1, most + 1))):
         model = stock.model(rng, small)
-        size = float(rng.uniform(0.06, 0.3)) * min(1.0, max(width, depth))
+        size = rng.uniform(0.06, 0.3) * min(1.0, max(width, depth))
         if model is not None and rng.random() < 0.2:
             model = None
         spot = surface.find(rng, *((size, size) if model is None else (model.size[0], model.size[2])), top, walls=0)
         if spot is None:
             continue
-        where = frame @ spot
         if model is None:
-            builder.add(ornament(builder, rng, size), where, movable=True)
-            builder.points.append(where[:3, 3])
+            builder.add(ornament(builder, rng, size), frame @ spot, movable=True, look=(0, 0, 0))
         else:
-            add_model(builder, rng, stock, model, where, movable=True)
+            add_model(builder, rng, stock, model, frame @ spot, movable=True)

@@ -78,7 +78,7 @@ def _print(rng: Rng, area: float) -> dict[str, object]:
         weight = np.zeros((side, side, 1))
         weight[::step], weight[:, ::step] = 1, 1
     ink, paper = np.array(random_color(rng)), np.array(random_color(rng))
-    repeat = max(1.0, round(math.sqrt(area) * float(rng.uniform(0.5, 3))))
+    repeat = max(1.0, round(math.sqrt(area) * rng.uniform(0.5, 3)))
     return diffuse(weight * ink + (1 - weight) * paper, (repeat, repeat))
 
 
@@ -134,7 +134,7 @@ def _evening(rng: Rng, stock: Stock) -> SceneBuilder:
 
 def _desk(rng: Rng, stock: Stock) -> SceneBuilder:
     """Small things on a table before a wall, seen from near."""
-    wide, deep = float(rng.uniform(0.9, 1.8)), float(rng.uniform(0.6, 0.9))
+    wide, deep = rng.uniform(0.9, 1.8), rng.uniform(0.6, 0.9)
     builder = SceneBuilder((-wide * 0.8, 0.05, -deep / 2), (wide * 0.8, 1.1, deep * 1.6))
     top = builder.material(random_opaque(rng, (1.0, 1.0), textured=0.7))
     builder.add([box((0, -0.02, 0), (wide, 0.04, deep), top)])
@@ -145,23 +145,23 @@ def _desk(rng: Rng, stock: Stock) -> SceneBuilder:
         side = float(rng.choice([-1, 1]))
         builder.add([box((side * (wide / 2 + 0.4), 0.6, 1), (0.1, 3.0, 6), wall)])
     if rng.random() < 0.4:
-        shelf = place((0, float(rng.uniform(0.35, 0.6)), -deep / 2 + 0.1))
+        shelf = place((0, rng.uniform(0.35, 0.6), -deep / 2 + 0.1))
         builder.add([box((0, -0.01, 0), (wide, 0.02, 0.25), top)], shelf)
         fill_top(builder, rng, stock, shelf, wide, 0.25, 0.0, most=9)
     fill_top(builder, rng, stock, np.eye(4), wide, deep, 0.0, most=16)
     lights = int(rng.integers(0, 3))
     sun = sun_direction(rng, 0.0) if rng.random() < 0.5 else None
     if lights == 0 or rng.random() < 0.6:
-        builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.1, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
+        builder.set_sky(any_sky(rng, stock, rng.uniform(0.1, 1), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
     for _ in range(lights):
         origin = np.array((rng.uniform(-1, 1), rng.uniform(0.5, 1.6), rng.uniform(0, 1.4)))
-        softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(3, 15)) / lights)
+        softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), rng.uniform(3, 15) / lights)
     return builder
 
 
 def _street(rng: Rng, stock: Stock) -> SceneBuilder:
     """Ground under a sky, with plants, vehicles, people and blocks of houses."""
-    reach = float(rng.uniform(4, 9))
+    reach = rng.uniform(4, 9)
     builder = SceneBuilder((-reach, 0.25, -reach), (reach, 2.6, reach))
     repeat = float(rng.integers(8, 40))
     ground = builder.material(random_opaque(rng, (repeat, repeat), textured=0.85))
@@ -184,18 +184,18 @@ def _street(rng: Rng, stock: Stock) -> SceneBuilder:
 
 def _pool(rng: Rng, stock: Stock) -> SceneBuilder:
     """A basin of water under a sky, with things around it and in it."""
-    wide, deep = float(rng.uniform(1.5, 4)), float(rng.uniform(1.5, 4))
+    wide, deep = rng.uniform(1.5, 4), rng.uniform(1.5, 4)
     builder = SceneBuilder((-wide, 0.15, -deep), (wide, 1.8, deep))
     tiles = builder.material(random_opaque(rng, (4, 4), textured=0.95))
     stone = builder.material(random_opaque(rng, (6, 6), textured=0.6))
-    depth = float(rng.uniform(0.2, 0.8))
+    depth = rng.uniform(0.2, 0.8)
     parts = [box((0, -depth - 0.05, 0), (wide + 0.4, 0.1, deep + 0.4), tiles)]
     for sign in (-1, 1):
         parts.append(box((sign * (wide / 2 + 2.0), -0.5, 0), (4, 1, deep + 8), stone))
         parts.append(box((0, -0.5, sign * (deep / 2 + 2.0)), (wide, 1, 4), stone))
     builder.add(parts)
-    level = -float(rng.uniform(0.02, 0.15))
-    surface = place((0, level, 0), scale=(wide / 2, float(rng.uniform(0.003, 0.02)), deep / 2))
+    level = -rng.uniform(0.02, 0.15)
+    surface = place((0, level, 0), scale=(wide / 2, rng.uniform(0.003, 0.02), deep / 2))
     water = builder.material(glass(1.33))
     builder.add([shape("mesh", surface, water, mesh=_waves(rng))])
     for _ in range(4):
@@ -234,8 +234,8 @@ def _display(rng: Rng, stock: Stock) -> SceneBuilder:
         if model is None:
             break
         spot = rng.uniform(-0.5, 0.5, 3) * (1 if number else 0)
-        frame = place(spot - (0, 0.3, 0), float(rng.uniform(0, 360)))
-        size = float(rng.uniform(0.5, 1.1))
+        frame = place(spot - (0, 0.3, 0), rng.uniform(0, 360))
+        size = rng.uniform(0.5, 1.1)
         add_model(builder, rng, stock, model, frame, scale=size / max(model.size), movable=True)
     if rng.random() < 0.3:
         base = builder.material(random_opaque(rng, textured=0.5))
