@@ -88,7 +88,12 @@ class _Translator:
             if not isinstance(entry, Mapping):
                 continue
             if entry["type"] in ("point", "spot"):
-                lights.append(_light(entry))
+                light = {"type": entry["type"], "intensity": _rgb(entry["intensity"])}
+                if entry["type"] == "point":
+                    lights.append(light | {"position": list(entry["position"])})
+                else:
+                    pose = np.asarray(entry["to_world"]).tolist()
+                    lights.append(light | {"to_world": pose, "cutoff": entry["cutoff_angle"]})
             elif entry["type"] == "envmap":
                 self._arrays["sky"] = np.ascontiguousarray(entry["bitmap"], dtype=np.float32)
                 sky = {"texture": "sky"}
@@ -179,13 +184,6 @@ class _Translator:
         name = self._textures.setdefault(image.tobytes() + str(image.shape).encode(), f"texture{len(self._textures)}")
         self._arrays[name] = np.broadcast_to(image, (*image.shape[:2], 3)).copy()
         return {"texture": name, "scale": np.diagonal(value["to_uv"])[:2].tolist()}
-
-
-def _light(light: Mapping[str, Any]) -> dict[str, Any]:
-    found = {"type": light["type"], "intensity": _rgb(light["intensity"])}
-    if light["type"] == "point":
-        return found | {"position": list(light["position"])}
-    return found | {"to_world": np.asarray(light["to_world"]).tolist(), "cutoff": light["cutoff_angle"]}
 
 
 def _rgb(value: Any) -> list[float]:

@@ -134,13 +134,9 @@ def _looks(take: Take) -> dict[str, tuple[float, ...]]:
         if material is not None:
             while "bsdf" in material:
                 material = material["bsdf"]
+            alpha = material.get("alpha", float(material["type"] == "diffuse"))
+            mean = float(np.mean(alpha["bitmap"] if isinstance(alpha, Mapping) else alpha))
             color = {"black": (0, 0, 0), "white": (1, 1, 1), "color": METALS.get(material.get("material"), (1, 1, 1))}
-            looks[name] = (_roughness(material), *color[take.glossy])
+            # Perceptual roughness is the root of Beckmann's parameter.
+            looks[name] = (math.sqrt(min(max(mean, 0.0), 1.0)), *color[take.glossy])
     return looks
-
-
-def _roughness(bsdf: Mapping[str, Any]) -> float:
-    """Perceptual roughness, the root of Beckmann's parameter."""
-    alpha = bsdf.get("alpha", float(bsdf["type"] == "diffuse"))
-    mean = float(np.mean(alpha["bitmap"] if isinstance(alpha, Mapping) else alpha))
-    return math.sqrt(min(max(mean, 0.0), 1.0))
