@@ -274,19 +274,9 @@ def _catalogue(path: Path) -> Iterator[Model]:
             continue
         if member not in present or len(rotation) != 9 or not 0.005 < max(size) < 30:
             continue
-        yield Model(
-            f"{path.stem}/{Path(member).stem}",
-            f"{row.get('creator', path.stem)}, {licence}",
-            row.get("category", ""),
-            size,
-            elevation,
-            max(top, 0.0),
-            row.get("doorOrWindow") == "true",
-            lamps,
-            path,
-            member,
-            rotation,
-        )
+        name, credit = f"{path.stem}/{Path(member).stem}", f"{row.get('creator', path.stem)}, {licence}"
+        category, opening = row.get("category", ""), row.get("doorOrWindow") == "true"
+        yield Model(name, credit, category, size, elevation, max(top, 0.0), opening, lamps, path, member, rotation)
 
 
 def _metres(text: str) -> float:
