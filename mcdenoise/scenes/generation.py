@@ -154,8 +154,8 @@ class TakePlan(Plan):
         about, own = self.out / "takes.json", self.identity
         try:
             self.out.mkdir(parents=True, exist_ok=True)
-            found = json.loads(read_text(about)) if about.exists() else dict(own)
-        except (OSError, ValueError) as error:
+            found = dict(json.loads(read_text(about)) if about.exists() else own)
+        except (OSError, ValueError, TypeError) as error:
             raise InputError(f"{self.out}: expected a folder to write takes to, found {error}") from error
         if "variant" not in found:
             # Only the takes themselves tell it in an older folder.

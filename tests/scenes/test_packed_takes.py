@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mcdenoise.cli import main
 from mcdenoise.data.camera_path import Camera
@@ -195,6 +196,13 @@ def test_a_folder_of_takes_is_of_one_variant(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"expected takes with variant scalar_rgb, found {found}"):
             other.render(7)
         assert same.render(7).name == "000007.take.npz"
+
+
+@pytest.mark.parametrize("content", ["[]", "5", "{", '{"takes": 2}'])
+def test_a_folder_of_something_else_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "takes.json").write_text(content)
+    plan = TakePlan(out=tmp_path, assets=NOTHING, unseen=False, variant="scalar_rgb")
+    assert str(tmp_path) in refused(plan.render, 7)
 
 
 def test_takes_are_generated_resumed_and_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
