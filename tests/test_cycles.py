@@ -29,8 +29,7 @@ from mcdenoise.scenes.assets import Mesh as Triangles
 from mcdenoise.scenes.cycles import Blender, render_cycles
 from mcdenoise.scenes.cycles.process import PYTHON_VARIABLE
 from mcdenoise.scenes.cycles.sequence import _prolonged, buffers_of
-from mcdenoise.scenes.cycles.shapes import Mesh, tessellate
-from mcdenoise.scenes.cycles.translate import translate
+from mcdenoise.scenes.cycles.translate import Mesh, tessellate, translate
 from mcdenoise.scenes.random.builder import place, rgb, rotate
 from mcdenoise.scenes.render import Film
 from mcdenoise.scenes.takes.draw import Take, draw_take

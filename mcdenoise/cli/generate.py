@@ -15,10 +15,9 @@ from mcdenoise.cli.render import RenderOptions
 from mcdenoise.data.sequences import parse_frames
 from mcdenoise.engines import RayEngine, parse_workers, run_each
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.assets import Assets, default_folder, open_assets
-from mcdenoise.scenes.generation import SequencePlan
+from mcdenoise.scenes.assets import Assets, open_assets
+from mcdenoise.scenes.generation import Plan, SequencePlan, TakePlan
 from mcdenoise.scenes.render import choose_variant
-from mcdenoise.scenes.takes import Plan, TakePlan
 from mcdenoise.scenes.takes.tracing import stratified
 
 _FOR_TRAINING = RenderOptions(noise_seeds=3, reference_spp=64, size="160x160")
@@ -81,7 +80,7 @@ def generate(
     common: dict[str, Any] = {
         "out": Path(os.path.abspath(out)),
         "threads": threads or int(workers is None),
-        "assets": Assets() if assets == "none" else open_assets(Path(assets or default_folder()), warn),
+        "assets": Assets() if assets == "none" else open_assets(Path(assets) if assets else None, warn),
         "unseen": unseen,
     }
     plan: Plan

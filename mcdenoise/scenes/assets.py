@@ -88,6 +88,11 @@ class Mesh:
     uv: NDArray[np.float32] | None
     normals: NDArray[np.float32] | None
 
+    @property
+    def texcoords(self) -> NDArray[Any]:
+        """``(N, 2)`` as Mitsuba has them, whose images begin at the top; 0 where there are none."""
+        return np.zeros((len(self.vertices), 2)) if self.uv is None else self.uv * (1, -1) + (0, 1)
+
 
 @dataclass(frozen=True)
 class Lamp:
@@ -175,21 +180,17 @@ class Assets:
         return f"{path.stem} ({_CREDITS[path.suffix]}, by @pmndrs/assets, CC0 1.0)"
 
 
-def default_folder() -> Path:
-    """The folder in the user's cache."""
-    return cache_file("assets")
-
-
-def open_assets(folder: Path, say: Callable[[str], None]) -> Assets:
+def open_assets(folder: Path | None, say: Callable[[str], None]) -> Assets:
     """The assets in a folder; packages that are not there are fetched, and one line says what is missing.
 
     Args:
-        folder: created if necessary.
+        folder: created if necessary; by default one in the user's cache.
         say: shows one line.
 
     Raises:
         InputError: the folder cannot be written, or an archive in it is damaged.
     """
+    folder = folder or cache_file("assets")
     make_folder(folder)
     furniture, images = folder / _FURNITURE, folder / "images"
     for target, client, package in ((furniture, _fetch_furniture, _DEBIAN), (images, _fetch_images, _NPM)):
@@ -214,7 +215,7 @@ def read_sky(path: Path) -> Image:
 
 def read_normal_map(path: Path) -> Image:
     """``(H, W, 3)`` in 0 to 1."""
-    return _read_image(read_bytes(path, _LARGEST_MEMBER), path.suffix, path)[..., :3]
+    return _read_image(read_bytes(path, _LARGEST_MEMBER), path)[..., :3]
 
 
 def _run(work: Path, *command: str) -> None:
@@ -273,19 +274,9 @@ def _catalogue(path: Path) -> Iterator[Model]:
             continue
         if member not in present or len(rotation) != 9 or not 0.005 < max(size) < 30:
             continue
-        yield Model(
-            f"{path.stem}/{Path(member).stem}",
-            f"{row.get('creator', path.stem)}, {licence}",
-            row.get("category", ""),
-            size,
-            elevation,
-            max(top, 0.0),
-            row.get("doorOrWindow") == "true",
-            lamps,
-            path,
-            member,
-            rotation,
-        )
+        name, credit = f"{path.stem}/{Path(member).stem}", f"{row.get('creator', path.stem)}, {licence}"
+        category, opening = row.get("category", ""), row.get("doorOrWindow") == "true"
+        yield Model(name, credit, category, size, elevation, max(top, 0.0), opening, lamps, path, member, rotation)
 
 
 def _metres(text: str) -> float:
@@ -336,12 +327,8 @@ def _read_obj(files: zipfile.ZipFile, member: str, rotation: NDArray[np.float64]
     vertices = (vertices - (low + high) / 2) / np.maximum((high - low) / 2, 1e-6)
     normals, uv = _table(columns["vn"], 3) @ rotation.T, _table(columns["vt"], 2)
     gray = Surface(np.full(3, 0.5, np.float32))
-    found = []
-    for name, polygons in faces.items():
-        mesh = _triangles(polygons, vertices, uv, normals)
-        if mesh is not None:
-            found.append((mesh, surfaces.get(name, gray)))
-    return found
+    meshes = {name: _triangles(polygons, vertices, uv, normals) for name, polygons in faces.items()}
+    return [(mesh, surfaces.get(name, gray)) for name, mesh in meshes.items() if mesh is not None]
 
 
 def _table(rows: list[str], columns: int) -> NDArray[np.float64]:
@@ -400,18 +387,18 @@ def _surface(files: zipfile.ZipFile, member: str, row: dict[str, str]) -> Surfac
     if "map_Kd" in row:
         # Options stand before the name; names with spaces have none.
         name = row["map_Kd"].split()[-1] if row["map_Kd"].startswith("-") else row["map_Kd"]
-        image = _read_image(_member(files, _near(member, name)), Path(name).suffix, Path(name))
+        image = _read_image(_member(files, _near(member, name)), Path(name))
         color = linear(image[..., :3]) if image.shape[2] >= 3 else np.repeat(linear(image[..., :1]), 3, -1)
         if image.shape[2] == 4 and float(image[..., 3].min()) < 0.5:
             opacity = image[..., 3:]
     return Surface(color, opacity, float(numbers("Ks", "0 0 0").mean()), float(numbers("Ns", "10")[0]))
 
 
-def _read_image(content: bytes, suffix: str, path: Path) -> Image:
+def _read_image(content: bytes, path: Path) -> Image:
     """Pixels ``(H, W, C)`` in 0 to 1, of at most ``_TEXTURE`` pixels a side."""
     import OpenImageIO as oiio
 
-    with tempfile.NamedTemporaryFile(suffix=suffix if suffix.isascii() else "") as file:
+    with tempfile.NamedTemporaryFile(suffix=path.suffix if path.suffix.isascii() else "") as file:
         # Not all readers read from memory.
         file.write(content)
         file.flush()

@@ -53,7 +53,7 @@ def _room() -> dict[str, Part]:
     return {
         "floor": sheet((0, 0, 0.5), (3, 3.5), rough_plastic(_planks(), 0.15), rotate("x", -90)),
         "ceiling": sheet((0, 2.7, 0.5), (3, 3.5), diffuse((0.8, 0.8, 0.78)), rotate("x", 90)),
-        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_wallpaper()), np.eye(4)),
+        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_wallpaper())),
         "wall_left": sheet((-3, 1.35, 0.5), (3.5, 1.35), plaster, rotate("y", 90)),
         "wall_right": sheet((3, 1.35, 0.5), (3.5, 1.35), diffuse((0.62, 0.16, 0.1)), rotate("y", -90)),
         "wall_front": sheet((0, 1.35, 4), (3, 1.35), plaster, rotate("y", 180)),
@@ -93,7 +93,7 @@ def _shelf() -> dict[str, Part]:
             )
             left += width
     parts["picture_frame"] = box((0.75, 1.6, -2.97), (1.3, 0.95, 0.05), wood)
-    parts["picture"] = sheet((0.75, 1.6, -2.94), (0.6, 0.425), diffuse(_painting()), np.eye(4))
+    parts["picture"] = sheet((0.75, 1.6, -2.94), (0.6, 0.425), diffuse(_painting()))
     return parts
 
 

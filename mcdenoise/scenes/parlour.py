@@ -61,13 +61,13 @@ def _room() -> dict[str, Part]:
     return {
         "floor": sheet((0, 0, 0.4), (3, 3.6), rough_plastic(_parquet(), 0.12), rotate("x", -90)),
         "ceiling": sheet((0, 2.7, 0.4), (3, 3.6), diffuse((0.78, 0.77, 0.74)), rotate("x", 90)),
-        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_damask()), np.eye(4)),
+        "wall_back": sheet((0, 1.35, -3), (3, 1.35), diffuse(_damask())),
         "wall_left": sheet((-3, 1.35, 0.4), (3.6, 1.35), diffuse((0.3, 0.38, 0.42)), rotate("y", 90)),
         "wall_right": sheet((3, 1.35, 0.4), (3.6, 1.35), diffuse((0.66, 0.6, 0.5)), rotate("y", -90)),
         "wall_front": sheet((0, 1.35, 4), (3, 1.35), diffuse((0.7, 0.68, 0.62)), rotate("y", 180)),
-        "mirror": sheet((-1.15, 1.5, -2.95), (0.55, 0.6), mirror(), np.eye(4)),
+        "mirror": sheet((-1.15, 1.5, -2.95), (0.55, 0.6), mirror()),
         "mirror_frame": box((-1.15, 1.5, -2.985), (1.22, 1.32, 0.05), rough_metal("Au", 0.2)),
-        "page": sheet((0.42, 1.6, -2.985), (0.3, 0.4), diffuse(_writing()), np.eye(4)),
+        "page": sheet((0.42, 1.6, -2.985), (0.3, 0.4), diffuse(_writing())),
     }
 
 

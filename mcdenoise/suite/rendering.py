@@ -15,7 +15,7 @@ from mcdenoise.data import Sequence, open_sequence, read_exr, write_exr
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.data.files import atomic_path, make_folder, write_json
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.assets import default_folder, open_assets
+from mcdenoise.scenes.assets import open_assets
 from mcdenoise.scenes.cycles import Blender
 from mcdenoise.scenes.parlour import parlour_cameras, parlour_moves, parlour_scene
 from mcdenoise.scenes.render import Film, render_sequence
@@ -126,7 +126,7 @@ def _mitsuba_scene(shot: Shot) -> tuple[dict[str, Any], list[Camera], dict[str, 
     _, _, number = shot.scene.partition(" ")
     if number:
         missing: list[str] = []
-        assets = open_assets(default_folder(), missing.append)
+        assets = open_assets(None, missing.append)
         if missing:
             raise InputError(f"{shot.name}: {missing[0]}; expected all models and images, which it is made of")
         take = draw_take(int(number), assets.part(unseen=True), frames=shot.frames, size=shot.size, stills=False)

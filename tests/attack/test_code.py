@@ -173,7 +173,7 @@ def test_modules_of_the_working_folder_are_not_imported(line: str, here: Path, s
 
 def test_native_code_beside_a_scene_is_not_loaded(here: Path) -> None:
     pytest.importorskip("mitsuba", reason="rendering needs Mitsuba: pip install 'mcdenoise[render]'")
-    from mcdenoise.scenes.render.stage import Stage
+    from mcdenoise.scenes.render.loading import Stage
 
     (here / "plugins").mkdir()
     for suffix in (".so", ".dylib", ".dll"):

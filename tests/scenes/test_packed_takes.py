@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mcdenoise.cli import main
 from mcdenoise.data.camera_path import Camera
 from mcdenoise.data.shards import find_shards, open_shard, write_shard
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets
+from mcdenoise.scenes.generation import TakePlan
 from mcdenoise.scenes.random.materials import diffuse, glass
 from mcdenoise.scenes.render.film import Film, curve, offsets, splat
-from mcdenoise.scenes.takes import TakePlan
 from mcdenoise.scenes.takes.draw import Take, draw_take
 
 NOTHING = Assets()
@@ -89,7 +90,6 @@ def traced(take: Take) -> tuple[dict[str, Any], Any]:
     from mcdenoise.scenes.takes.tracing import TakeTracer
 
     tracer = TakeTracer(take, "scalar_rgb", half=20)
-    tracer.place(1)
     return tracer.noisy(1), tracer.halves(1)
 
 
@@ -196,6 +196,13 @@ def test_a_folder_of_takes_is_of_one_variant(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"expected takes with variant scalar_rgb, found {found}"):
             other.render(7)
         assert same.render(7).name == "000007.take.npz"
+
+
+@pytest.mark.parametrize("content", ["[]", "5", "{", '{"takes": 2}'])
+def test_a_folder_of_something_else_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "takes.json").write_text(content)
+    plan = TakePlan(out=tmp_path, assets=NOTHING, unseen=False, variant="scalar_rgb")
+    assert str(tmp_path) in refused(plan.render, 7)
 
 
 def test_takes_are_generated_resumed_and_trained_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,7 +144,6 @@ def test_scenes_can_be_traced_from_free_space_and_are_not_black() -> None:
     for seed in range(3):
         made = drawn(seed)
         tracer = SequenceTracer(made.scene, "scalar_rgb", made.moves, made.cameras, (8, 8), None, 8)
-        tracer.place(FRAMES - 1)
         found = tracer.features(FRAMES - 1)
         distance = np.linalg.norm(found["position"] - made.cameras[-1].to_world[:3, 3], axis=1)
         assert (distance < CLOSE).mean() < 0.1, seed

@@ -24,21 +24,19 @@ class Blender:
         python: an interpreter that can import ``bpy``; by default that of the environment variable
             ``BLENDER_PYTHON``, or else this one.
 
-    Attributes:
-        python: path of the interpreter.
-        version: version of Blender.
+    ``version`` is that of Blender.
 
     Raises:
         InputError: the interpreter does not exist, or has no ``bpy``.
     """
 
     def __init__(self, python: Path | None = None) -> None:
-        self.python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
+        python = python or Path(os.environ.get(PYTHON_VARIABLE, sys.executable))
         self._said: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
         try:
             self._process = subprocess.Popen(
                 # -P: do not import the modules beside the script.
-                [str(self.python), "-P", str(_SCRIPT)],
+                [str(python), "-P", str(_SCRIPT)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._said,
@@ -47,14 +45,14 @@ class Blender:
         except OSError as error:
             self._said.close()
             raise InputError(
-                f"{self.python}: expected a Python that has Blender's module bpy, found nothing that runs "
+                f"{python}: expected a Python that has Blender's module bpy, found nothing that runs "
                 f"({error.strerror}); name one by {PYTHON_VARIABLE}"
             ) from error
         answer = self._answer()
         if "ok" not in answer:
             self.close()
             raise InputError(
-                f"{self.python}: expected a Python that has Blender's module bpy, found none "
+                f"{python}: expected a Python that has Blender's module bpy, found none "
                 f"({answer['error']}); pip install bpy==4.5.15 into a Python 3.11 and name it by {PYTHON_VARIABLE}"
             )
         self.version: str = answer["ok"]

@@ -31,8 +31,8 @@ from mcdenoise.scenes.cycles.process import Blender
 from mcdenoise.scenes.cycles.translate import translate
 from mcdenoise.scenes.render.folder import SequenceFolder, write_reference
 from mcdenoise.scenes.render.halves import ReferenceState
+from mcdenoise.scenes.render.loading import to_previous
 from mcdenoise.scenes.render.sequence import check_lowest, wanted_references
-from mcdenoise.scenes.render.stage import to_previous
 from mcdenoise.scenes.takes.draw import Take
 
 _PASSES = ("Combined", "Denoising Albedo", "Denoising Normal", "Depth", "Position", "IndexOB")
@@ -43,6 +43,8 @@ _LIGHT = [
     *(f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")),
     *("emit", "environment"),
 ]
+# Buffers that every frame has, see `buffers_of`.
+_FEATURES = ("albedo", "normal", "position", "depth")
 _REFERENCE_STREAM = 1
 # Minimum ratio of reference samples to noisy samples: a reference with nearly the same noise would teach nothing.
 _CLEANER = 4
@@ -113,7 +115,7 @@ def render_cycles(
         blurred = np.random.default_rng((seed, _STREAM)).random() < _BLURRED
         shutter = _SHUTTER if blurred and count > 1 else 0.0
     used = take.film.filter if take.film.filter in _WIDTHS else _DEFAULT_FILTER
-    settings = {"filter": used, "aperture": take.film.aperture, "focus": take.film.focus, "shutter": shutter}
+    film = {"filter": used, "aperture": take.film.aperture, "focus": take.film.focus, "shutter": shutter}
     clean_spp = max(reference_spp, _CLEANER * spp)
     # The sky stands still in Cycles.
     moves = check_moves({name: path for name, path in take.moves.items() if name != "sky"}, count)
@@ -131,7 +133,7 @@ def render_cycles(
         _CONVENTIONS,
         renderer=f"Blender {blender.version}, Cycles",
         noisy_spp=spp,
-        film=dict(settings),
+        film=film,
         noise_seeds=noise_seeds,
         seed=seed,
         position_limit_squared=(0.005 * scale) ** 2,
@@ -154,10 +156,9 @@ def render_cycles(
         file = Path(place) / "shot.exr"
         if noisy or clean:
             description.save(Path(place))
-            settings |= _for_blender(take, {name: moves[name] for name in movers})
             passes = ["z", "position", "object_index", *(_LIGHT if parts else [])]
+            settings = _for_blender(take, film, {name: moves[name] for name in movers})
             settings |= {"size": list(size), "threads": threads, "passes": passes, "clamped": False}
-            settings |= {"box": used == "box", "filter_width": _WIDTHS[used]}
             blender.ask("scene", folder=place, settings=settings)
 
         def shot(number: int, samples: int, stream: int, back: Mapping[int, Array]) -> dict[str, Tensor]:
@@ -182,10 +183,6 @@ def render_cycles(
             write_reference(folder.path, number, found["color"], state)
             folder.note_reference(number, state)
     return folder.path
-
-
-# Buffers that every frame has, see `buffers_of`.
-_FEATURES = ("albedo", "normal", "position", "depth")
 
 
 def buffers_of(images: Mapping[str, Image], camera: Camera, back: Mapping[int, Array]) -> dict[str, Image]:
@@ -222,10 +219,13 @@ def buffers_of(images: Mapping[str, Image], camera: Camera, back: Mapping[int, A
     return {**buffers, "color": images["Combined"][..., :3]}
 
 
-def _for_blender(take: Take, moves: Mapping[str, Array]) -> dict[str, Any]:
-    """Placements from one frame before the first to one after the last."""
+def _for_blender(take: Take, film: Mapping[str, Any], moves: Mapping[str, Array]) -> dict[str, Any]:
+    """The film, and placements from one frame before the first to one after the last."""
     fovs = [camera.fov_x for camera in take.cameras]
     return {
+        **film,
+        "box": film["filter"] == "box",
+        "filter_width": _WIDTHS[film["filter"]],
         "cameras": _prolonged(np.stack([camera.to_world for camera in take.cameras])).tolist(),
         "fov_x": [fovs[0], *fovs, fovs[-1]],
         "moves": {name: _prolonged(path).tolist() for name, path in moves.items()},

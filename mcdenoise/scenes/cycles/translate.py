@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.files import writing
 from mcdenoise.errors import InputError
-from mcdenoise.scenes.cycles.shapes import Mesh, of_triangles, tessellate
+from mcdenoise.scenes import assets
 from mcdenoise.scenes.random.materials import METALS
 
 _PLASTIC_IOR, _GLASS_IOR = 1.49, 1.5046
+# Lamps get few triangles, because Cycles chooses among all emitting triangles for every sample.
+_AROUND, _AROUND_A_LAMP = 64, 20
 # Inputs of Blender's Principled shader that make it diffuse.
 _DIFFUSE = {
     "Roughness": 1.0,
@@ -31,6 +35,33 @@ _DIFFUSE = {
     "Coat Roughness": 0.0,
     "Coat IOR": 1.5,
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Args:
+        vertices: ``(N, 3)``.
+        triangles: ``(F, 3)`` indices, counterclockwise seen from outside.
+        uv: ``(F, 3, 2)`` texture coordinates of each corner, as in Mitsuba.
+        smooth: whether normals are interpolated.
+        closed: whether the mesh is closed, so that back faces are not visible from outside.
+    """
+
+    vertices: Array
+    triangles: NDArray[np.int64]
+    uv: Array
+    smooth: bool = False
+    closed: bool = False
+
+    def placed(self, matrix: Array) -> Mesh:
+        """Transform the mesh by an affine ``(4, 4)`` matrix for column vectors."""
+        moved = replace(self, vertices=self.vertices @ matrix[:3, :3].T + matrix[:3, 3])
+        if np.linalg.det(matrix[:3, :3]) > 0:
+            return moved
+        # A reflection would turn the mesh inside out.
+        return replace(moved, triangles=self.triangles[:, ::-1], uv=self.uv[:, ::-1])
 
 
 class Description(NamedTuple):
@@ -88,7 +119,12 @@ class _Translator:
             if not isinstance(entry, Mapping):
                 continue
             if entry["type"] in ("point", "spot"):
-                lights.append(_light(entry))
+                light = {"type": entry["type"], "intensity": _rgb(entry["intensity"])}
+                if entry["type"] == "point":
+                    lights.append(light | {"position": list(entry["position"])})
+                else:
+                    pose = np.asarray(entry["to_world"]).tolist()
+                    lights.append(light | {"to_world": pose, "cutoff": entry["cutoff_angle"]})
             elif entry["type"] == "envmap":
                 self._arrays["sky"] = np.ascontiguousarray(entry["bitmap"], dtype=np.float32)
                 sky = {"texture": "sky"}
@@ -103,7 +139,7 @@ class _Translator:
     def _shape(self, entry: Mapping[str, Any]) -> tuple[Mesh, int]:
         radiance = _rgb(entry["emitter"]["radiance"]) if "emitter" in entry else [0.0]
         shines = any(radiance)
-        mesh = of_triangles(entry["mesh"]) if entry["type"] == "mesh" else tessellate(entry["type"], shines=shines)
+        mesh = _of_triangles(entry["mesh"]) if entry["type"] == "mesh" else tessellate(entry["type"], shines=shines)
         material = self._bsdf(entry["bsdf"])
         if shines:
             # Mitsuba's lamps emit on the side of their normal, Cycles' on both sides.
@@ -141,22 +177,24 @@ class _Translator:
         ior = float(bsdf.get("int_ior", _PLASTIC_IOR if "plastic" in kind else _GLASS_IOR))
         if kind == "thindielectric":
             return {"pane": ior}
-        makers = {"diffuse": self._diffuse, "plastic": self._plastic, "conductor": self._metal}
-        makers |= {"roughplastic": self._plastic, "roughconductor": self._metal, "dielectric": self._glass}
-        if kind not in makers:
-            raise InputError(f"expected a material that Cycles can be given ({', '.join(makers)}), found '{kind}'")
-        return {"inputs": {**_DIFFUSE, **makers[kind](bsdf, ior)}}
+        return {"inputs": {**_DIFFUSE, **self._inputs(bsdf, ior)}}
 
-    def _diffuse(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        return {"Base Color": self._value(bsdf["reflectance"])}
-
-    def _plastic(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        base, roughness = {"Base Color": self._value(bsdf["diffuse_reflectance"])}, math.sqrt(bsdf.get("alpha", 0))
-        if self._rng.random() < 0.5:
-            return base | {"Roughness": roughness, "Specular IOR Level": 0.5, "IOR": ior}
-        return base | {"Coat Weight": 1.0, "Coat Roughness": roughness, "Coat IOR": ior}
-
-    def _metal(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
+    def _inputs(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
+        """Inputs of a Principled shader where they are not those of a diffuse one."""
+        kind = bsdf["type"]
+        if kind == "diffuse":
+            return {"Base Color": self._value(bsdf["reflectance"])}
+        if kind == "dielectric":
+            inputs = {"Base Color": [1.0] * 3, "Transmission Weight": 1.0, "Roughness": 0.0}
+            return inputs | {"Specular IOR Level": 0.5, "IOR": ior}
+        if kind in ("plastic", "roughplastic"):
+            base, roughness = {"Base Color": self._value(bsdf["diffuse_reflectance"])}, math.sqrt(bsdf.get("alpha", 0))
+            if self._rng.random() < 0.5:
+                return base | {"Roughness": roughness, "Specular IOR Level": 0.5, "IOR": ior}
+            return base | {"Coat Weight": 1.0, "Coat Roughness": roughness, "Coat IOR": ior}
+        if kind not in ("conductor", "roughconductor"):
+            known = "diffuse, dielectric, plastic, roughplastic, conductor, roughconductor"
+            raise InputError(f"expected a material that Cycles can be given ({known}), found '{kind}'")
         metal, tint = np.array(METALS[bsdf["material"]]), bsdf.get("specular_reflectance", 1.0)
         if isinstance(tint, Mapping) and tint["type"] == "bitmap":
             tint = {**tint, "bitmap": np.asarray(tint["bitmap"]) * metal}
@@ -166,10 +204,6 @@ class _Translator:
         # Artists' roughness is the square root of GGX's alpha.
         rough = {**alpha, "bitmap": np.sqrt(alpha["bitmap"])} if isinstance(alpha, Mapping) else math.sqrt(alpha)
         return {"Base Color": self._value(tint), "Metallic": 1.0, "Roughness": self._value(rough)}
-
-    def _glass(self, bsdf: Mapping[str, Any], ior: float) -> dict[str, Any]:
-        inputs = {"Base Color": [1.0] * 3, "Transmission Weight": 1.0, "Roughness": 0.0}
-        return inputs | {"Specular IOR Level": 0.5, "IOR": ior}
 
     def _value(self, value: Any) -> Any:
         """A number or a color as three numbers, or a texture: ``{"texture": name, "scale": [u, v]}``."""
@@ -183,14 +217,87 @@ class _Translator:
         return {"texture": name, "scale": np.diagonal(value["to_uv"])[:2].tolist()}
 
 
-def _light(light: Mapping[str, Any]) -> dict[str, Any]:
-    found = {"type": light["type"], "intensity": _rgb(light["intensity"])}
-    if light["type"] == "point":
-        return found | {"position": list(light["position"])}
-    return found | {"to_world": np.asarray(light["to_world"]).tolist(), "cutoff": light["cutoff_angle"]}
-
-
 def _rgb(value: Any) -> list[float]:
     """The three channels of a number, or of a color."""
     channels = np.broadcast_to(value["value"] if isinstance(value, Mapping) else value, 3)
     return [float(channel) for channel in channels]
+
+
+def tessellate(kind: str, *, shines: bool = False) -> Mesh:
+    """Tessellate a shape plugin of Mitsuba: ``cube``, ``sphere``, ``cylinder``, ``disk`` or ``rectangle``.
+
+    Args:
+        kind: name of the plugin.
+        shines: whether it is a lamp, which gets fewer triangles.
+
+    Raises:
+        InputError: the shape is not supported.
+
+    Example:
+        >>> tessellate("cube").triangles.shape
+        (12, 3)
+    """
+    around = _AROUND_A_LAMP if shines else _AROUND
+    if kind == "cube":
+        return _cube()
+    if kind == "sphere":
+        return replace(_grid(around, around // 2, _on_sphere, down=True), smooth=True, closed=True)
+    if kind == "cylinder":
+        return replace(_grid(around, 1, lambda u, v: (*_circle(u), v)), smooth=True)
+    if kind == "disk":
+        # u is the radius and v the angle.
+        return _grid(1, around, lambda u, v: (*(u * side for side in _circle(v)), 0 * u))
+    if kind == "rectangle":
+        return _grid(1, 1, lambda u, v: (2 * u - 1, 2 * v - 1, 0 * u))
+    raise InputError(f"expected a shape that Cycles can be given, found '{kind}'")
+
+
+def _circle(turn: Array) -> tuple[Array, Array]:
+    return np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
+
+
+def _on_sphere(u: Array, v: Array) -> tuple[Array, ...]:
+    return (*(np.sin(np.pi * v) * side for side in _circle(u)), np.cos(np.pi * v))
+
+
+def _grid(columns: int, rows: int, place: Callable[[Array, Array], tuple[Array, ...]], *, down: bool = False) -> Mesh:
+    """Triangles of a grid over u and v from 0 to 1; points in the same place are one vertex.
+
+    Args:
+        columns: steps of u.
+        rows: steps of v.
+        place: the points of u and v.
+        down: whether v falls from row to row, which turns the outside to the other side.
+    """
+    v, u = np.mgrid[0 : 1 : (rows + 1) * 1j, 0 : 1 : (columns + 1) * 1j].reshape(2, -1)
+    v = 1 - v if down else v
+    points = np.stack(place(u, v), -1)
+    _, kept, names = np.unique(points.round(9) + 0.0, axis=0, return_index=True, return_inverse=True)
+    first = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    across = first + columns + 2
+    corners = np.stack([first, first + 1, across, first, across, across - 1], -1).reshape(-1, 3)
+    triangles = names.reshape(-1)[corners]
+    whole = (triangles != np.roll(triangles, 1, axis=1)).all(1)
+    return Mesh(points[kept], triangles[whole], np.stack([u, v], -1)[corners][whole])
+
+
+def _cube() -> Mesh:
+    """From -1 to 1 in every axis; each face has the whole of a texture."""
+    side = tessellate("rectangle")
+    faces: list[Mesh] = []
+    for axis in range(3):
+        for sign in (1, -1):
+            outside = slice(None, None, sign)
+            vertices = np.roll(side.vertices + np.array((0, 0, sign)), axis + 1, axis=1)
+            triangles = side.triangles[:, outside] + 4 * len(faces)
+            faces.append(Mesh(vertices, triangles, side.uv[:, outside]))
+    vertices, triangles, uv = (
+        np.concatenate([getattr(face, name) for face in faces]) for name in ("vertices", "triangles", "uv")
+    )
+    return Mesh(vertices, triangles, uv, closed=True)
+
+
+def _of_triangles(mesh: assets.Mesh) -> Mesh:
+    """The triangles of a model, with texture coordinates as Mitsuba has them, whose images begin at the top."""
+    vertices, faces = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    return Mesh(vertices, faces, mesh.texcoords[mesh.faces], smooth=mesh.normals is not None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any, TypeAlias
 
@@ -16,55 +15,30 @@ from mcdenoise.scenes.random.materials import Bsdf
 from mcdenoise.scenes.random.textures import Color
 
 Vector: TypeAlias = Sequence[float] | Array
+# A shape as in a Mitsuba dictionary, in the coordinates of its group.
+Part: TypeAlias = dict[str, Any]
 
+# Rotation about the vertical axis that turns +z into the room, for each wall: at -z, -x, +z and +x.
+TURNS = (0.0, 90.0, 180.0, -90.0)
 # Least and largest z of a shape in its own space, where they are not -1 and 1, as those of x and y are.
 _BOUNDS = {"cylinder": (0, 1), "disk": (0, 0), "rectangle": (0, 0)}
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A shape with its material, in the coordinates of its group.
-
-    Args:
-        kind: a shape plugin of Mitsuba.
-        to_group: ``(4, 4)`` transform from the shape's own space.
-        material: description of a material, or result of :meth:`SceneBuilder.material`.
-        radiance: emitted radiance, if it is a light.
-        mesh: triangles of a part of the kind ``"mesh"``.
-    """
-
-    kind: str
-    to_group: Array
-    material: Bsdf
-    radiance: Color | None = None
-    mesh: Mesh | None = None
-
-    def shape(self, to_world: Array) -> dict[str, Any]:
-        """Its entry in a Mitsuba dictionary, at a place."""
-        shape: dict[str, Any] = {"type": self.kind, "to_world": to_world, "bsdf": self.material}
-        if self.mesh is not None:
-            shape["mesh"] = self.mesh
-        if self.radiance is not None:
-            shape["emitter"] = {"type": "area", "radiance": rgb(self.radiance), "sampling_weight": 1.0}
-        return shape
 
 
 class SceneBuilder:
     """Collects materials, shapes and lights as a Mitsuba dictionary.
 
     ``low`` and ``high`` are the bounds for people and cameras. ``points`` are points of interest for cameras.
-    ``groups`` are movable objects, with the ids of their shapes. ``lamps`` are the ids of the emitting shapes.
+    ``groups`` are the ids of the shapes of each movable object.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
         self.low, self.high = np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
         self.points: list[Array] = []
-        self.groups: dict[str, list[str]] = {}
-        self.lamps: list[str] = []
+        self.groups: list[list[str]] = []
         self._materials: dict[str, Any] = {}
         self._objects: dict[str, Any] = {}
         self._lights: dict[str, Any] = {}
-        self._sky: dict[str, Any] | None = None
+        self._sky: dict[str, Any] = {}
         self._bounds: list[tuple[Array, Array]] = []
 
     def material(self, bsdf: Bsdf) -> dict[str, str]:
@@ -85,20 +59,28 @@ class SceneBuilder:
         """Replace every material by the result of ``change`` for its id and description."""
         self._materials = {name: change(name, bsdf) for name, bsdf in self._materials.items()}
 
-    def add(self, parts: Iterable[Part], to_world: Array | None = None, movable: bool = False) -> list[str]:
-        """Add a group of parts to the scene; returns the ids of its shapes."""
+    def add(
+        self, parts: Iterable[Part], to_world: Array | None = None, *, movable: bool = False, look: Vector | None = None
+    ) -> None:
+        """Add a group of parts to the scene.
+
+        Args:
+            parts: shapes in the coordinates of the group.
+            to_world: ``(4, 4)`` place of the group.
+            movable: whether it may move.
+            look: a point of interest, in the coordinates of the group.
+        """
         names = []
         for part in parts:
-            matrix = part.to_group if to_world is None else to_world @ part.to_group
-            name = f"{'lamp' if part.radiance else part.kind}_{len(self._objects)}"
-            self._objects[name] = part.shape(matrix)
-            if part.radiance is not None:
-                self.lamps.append(name)
-            self._bounds.append(bounds(part.kind, matrix))
+            matrix = part["to_world"] if to_world is None else to_world @ part["to_world"]
+            name = f"{'lamp' if 'emitter' in part else part['type']}_{len(self._objects)}"
+            self._objects[name] = {**part, "to_world": matrix}
+            self._bounds.append(bounds(part["type"], matrix))
             names.append(name)
         if movable:
-            self.groups[f"group_{len(self.groups)}"] = names
-        return names
+            self.groups.append(names)
+        if look is not None:
+            self.points.append(np.array(look) if to_world is None else (to_world @ (*look, 1.0))[:3])
 
     def add_light(self, light: dict[str, Any]) -> None:
         """Add a light without a surface: a point or spot light."""
@@ -106,7 +88,16 @@ class SceneBuilder:
 
     def set_sky(self, image: Array) -> None:
         """Set the environment light, a lat-long image whose top row is the zenith."""
-        self._sky = {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}
+        self._sky = {"sky": {"type": "envmap", "bitmap": image, "sampling_weight": 1.0}}
+
+    def surface(self) -> float:
+        """Area of the sides of the bounds, floor and ceiling included, square metres."""
+        width, height, depth = self.high - self.low
+        return float(2 * (width * height + height * depth + depth * width))
+
+    def lamps(self) -> list[str]:
+        """Ids of the shapes that shine."""
+        return [name for name, shape in self._objects.items() if "emitter" in shape]
 
     def placed(self, name: str) -> Array:
         """Transform of a shape from its own space to world space."""
@@ -114,18 +105,17 @@ class SceneBuilder:
 
     def boxes(self) -> tuple[Array, Array]:
         """Lower and upper corners ``(N, 3)`` of the bounding boxes of all shapes, in order of insertion."""
-        lows, highs = ([box[end] for box in self._bounds] for end in (0, 1))
-        return np.array(lows).reshape(-1, 3), np.array(highs).reshape(-1, 3)
+        lows, highs = np.array(self._bounds).reshape(-1, 2, 3).swapaxes(0, 1)
+        return lows, highs
 
     def scene(self) -> dict[str, Any]:
         """The Mitsuba dictionary of what is there; a shape of the type ``"mesh"`` holds its triangles."""
-        sky = {} if self._sky is None else {"sky": self._sky}
-        return {"type": "scene", **self._materials, **self._objects, **self._lights, **sky}
+        return {"type": "scene", **self._materials, **self._objects, **self._lights, **self._sky}
 
 
 def scene_of(parts: Mapping[str, Part]) -> dict[str, Any]:
     """The Mitsuba dictionary of named parts, each with a material of its own."""
-    return {"type": "scene"} | {name: _plain(part.shape(part.to_group)) for name, part in parts.items()}
+    return {"type": "scene"} | {name: _plain(part) for name, part in parts.items()}
 
 
 def _plain(value: Any) -> Any:
@@ -143,6 +133,24 @@ def rgb(color: Color) -> dict[str, Any]:
     return {"type": "rgb", "value": [float(channel) for channel in color]}
 
 
+def shape(kind: str, to_group: Array, material: Bsdf, radiance: Color | None = None, mesh: Mesh | None = None) -> Part:
+    """A shape plugin of Mitsuba, or triangles.
+
+    Args:
+        kind: name of the plugin, or ``"mesh"``.
+        to_group: ``(4, 4)`` transform from the shape's own space.
+        material: description of a material, or result of :meth:`SceneBuilder.material`.
+        radiance: emitted radiance, if it is a light.
+        mesh: triangles of the kind ``"mesh"``.
+    """
+    part: Part = {"type": kind, "to_world": to_group, "bsdf": material}
+    if mesh is not None:
+        part["mesh"] = mesh
+    if radiance is not None:
+        part["emitter"] = {"type": "area", "radiance": rgb(radiance), "sampling_weight": 1.0}
+    return part
+
+
 def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
     """Lower and upper corner of a transformed shape's axis-aligned bounding box."""
     corners = np.array([*product((-1, 1), (-1, 1), _BOUNDS.get(kind, (-1, 1)))], dtype=np.float64)
@@ -152,10 +160,7 @@ def bounds(kind: str, matrix: Array) -> tuple[Array, Array]:
 
 def place(position: Vector, turn: float = 0, scale: Vector = (1, 1, 1), rotation: Array | None = None) -> Array:
     """A transform: scale, rotate, rotate about the vertical axis by ``turn`` degrees, translate."""
-    matrix = rotate("y", turn)
-    if rotation is not None:
-        matrix = matrix @ rotation
-    matrix = matrix @ np.diag((*scale, 1.0))
+    matrix = rotate("y", turn) @ (np.eye(4) if rotation is None else rotation) @ np.diag((*scale, 1.0))
     matrix[:3, 3] = position
     return np.asarray(matrix)
 
@@ -172,13 +177,12 @@ def rotate(axis: str, degrees: float) -> Array:
 
 def box(center: Vector, size: Vector, material: Bsdf, turn: float = 0, tilt: float = 0) -> Part:
     """A box of full ``size``, tilted about x, then rotated about y, in degrees."""
-    half_size = [0.5 * length for length in size]
-    return Part("cube", place(center, turn, half_size, rotate("x", tilt)), material)
+    return shape("cube", place(center, turn, [0.5 * length for length in size], rotate("x", tilt)), material)
 
 
 def ball(center: Vector, radius: float, material: Bsdf, radiance: Color | None = None) -> Part:
     """A sphere."""
-    return Part("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
+    return shape("sphere", place(center, scale=(radius, radius, radius)), material, radiance)
 
 
 def rod(start: Vector, end: Vector, radius: float, material: Bsdf) -> Part:
@@ -191,7 +195,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Bsdf) -> Part:
     first /= np.linalg.norm(first)
     matrix = np.eye(4)
     matrix[:3] = np.stack((first * radius, np.cross(axis, first) * radius, axis * length, np.asarray(start)), axis=1)
-    return Part("cylinder", matrix, material)
+    return shape("cylinder", matrix, material)
 
 
 def drum(foot: Vector, height: float, radius: float, material: Bsdf) -> list[Part]:
@@ -202,15 +206,11 @@ def drum(foot: Vector, height: float, radius: float, material: Bsdf) -> list[Par
 
 def plate(center: Vector, radius: float, material: Bsdf, up: bool = True) -> Part:
     """A horizontal disc."""
-    return Part("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
+    return shape("disk", place(center, 0, (radius, radius, 1), rotate("x", -90 if up else 90)), material)
 
 
 def sheet(
-    center: Vector,
-    half_size: Vector,
-    material: Bsdf,
-    rotation: Array,
-    radiance: Color | None = None,
+    center: Vector, half_size: Vector, material: Bsdf, rotation: Array | None = None, radiance: Color | None = None
 ) -> Part:
     """A rectangle that faces +z before the rotation."""
-    return Part("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)
+    return shape("rectangle", place(center, 0, (*half_size, 1), rotation), material, radiance)

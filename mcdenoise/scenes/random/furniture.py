@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import product
 from typing import TypeAlias
 
 import numpy as np
@@ -32,10 +33,8 @@ def ornament(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
 
 def furniture(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
     """A piece of furniture for a room of that height, its radius, and the height of its top (0 if it has none)."""
-    makers: tuple[Callable[[SceneBuilder, Rng, float], Piece], ...] = (
-        *(_table, _table, _chair, _chair, _shelf, _sofa, _stairs),
-        *(_screen, _crates, _big_plant, _pedestal, _railing),
-    )
+    makers: list[Callable[[SceneBuilder, Rng, float], Piece]] = [_table, _table, _chair, _chair, _shelf, _sofa, _stairs]
+    makers += [_screen, _crates, _big_plant, _pedestal, _railing]
     return makers[int(rng.integers(len(makers)))](builder, rng, height)
 
 
@@ -46,10 +45,10 @@ def picture_frame(builder: SceneBuilder, rng: Rng) -> list[Part]:
     image = builder.material(diffuse(picture(rng)))
     parts = [
         box((0, 0, 0.02), (width + 0.1, height + 0.1, 0.04), frame),
-        sheet((0, 0, 0.045), (width / 2, height / 2), image, np.eye(4)),
+        sheet((0, 0, 0.045), (width / 2, height / 2), image),
     ]
     if rng.random() < 0.3:
-        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), builder.material(pane()), np.eye(4)))
+        parts.append(sheet((0, 0, 0.06), (width / 2, height / 2), builder.material(pane())))
     return parts
 
 
@@ -59,36 +58,30 @@ def curtain(builder: SceneBuilder, rng: Rng, width: float, height: float) -> lis
     folds = int(np.clip(width / rng.uniform(0.06, 0.14), 4, 30))
     step = width / folds
     slope = rng.uniform(25, 60)
-    return [
-        sheet(
-            (-width / 2 + step * (fold + 0.5), -height / 2, 0),
-            (step / 2 / math.cos(math.radians(slope)), height / 2),
-            cloth,
-            rotate("y", slope if fold % 2 else -slope),
-        )
-        for fold in range(folds)
-    ]
+    half, turns = (step / 2 / math.cos(math.radians(slope)), height / 2), (rotate("y", -slope), rotate("y", slope))
+    middles = [(-width / 2 + step * (fold + 0.5), -height / 2, 0) for fold in range(folds)]
+    return [sheet(middle, half, cloth, turns[fold % 2]) for fold, middle in enumerate(middles)]
 
 
 def decorate(builder: SceneBuilder, rng: Rng, center: tuple[float, float, float], radius: float, count: int) -> None:
     """Put ornaments onto a surface without overlap."""
     taken: list[tuple[float, float, float]] = []
     for _ in range(3 * count):
-        size = float(rng.uniform(0.15, 0.5)) * min(radius, 1.0)
+        size = rng.uniform(0.15, 0.5) * min(radius, 1.0)
         angle, away = rng.uniform(0, 2 * math.pi), (radius - size / 2) * math.sqrt(rng.random()) * 0.85
         x, z = center[0] + away * math.cos(angle), center[2] + away * math.sin(angle)
         if any(math.hypot(x - a, z - b) < 0.5 * (size + c) for a, b, c in taken):
             continue
         taken.append((x, z, size))
-        builder.add(ornament(builder, rng, size), place((x, center[1], z), rng.uniform(0, 360)), movable=True)
-        builder.points.append(np.array((x, center[1] + 0.5 * size, z)))
+        parts, frame = ornament(builder, rng, size), place((x, center[1], z), rng.uniform(0, 360))
+        builder.add(parts, frame, movable=True, look=(0, 0.5 * size, 0))
         if len(taken) == count:
             return
 
 
 def glass_block(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     """A solid piece of glass that causes caustics."""
-    material = builder.material(glass(float(rng.uniform(1.4, 1.7))))
+    material = builder.material(glass(rng.uniform(1.4, 1.7)))
     if rng.random() < 0.6:
         return [ball((0, size / 2, 0), size / 2, material)]
     return [box((0, size / 2, 0), (size * 0.6, size, size * 0.6), material, rng.uniform(0, 90))]
@@ -124,11 +117,9 @@ def _ring(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     beads, radius = int(rng.integers(10, 25)), 0.4 * size
     bead = min(radius * math.sin(math.pi / beads) * rng.uniform(0.8, 1.4), 0.2 * size)
     upright = rng.random() < 0.5
-    parts = []
-    for number in range(beads):
-        c, s = (f(2 * math.pi * number / beads) * radius for f in (math.cos, math.sin))
-        parts.append(ball((c, radius + bead + s, 0) if upright else (c, bead, s), bead, material))
-    return parts
+    angles = [2 * math.pi * number / beads for number in range(beads)]
+    places = [(math.cos(angle) * radius, math.sin(angle) * radius) for angle in angles]
+    return [ball((c, radius + bead + s, 0) if upright else (c, bead, s), bead, material) for c, s in places]
 
 
 def _heap(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
@@ -160,7 +151,7 @@ def _book_pile(builder: SceneBuilder, rng: Rng, size: float) -> list[Part]:
     for _ in range(int(rng.integers(2, 7))):
         thick = size * rng.uniform(0.05, 0.16)
         material = builder.material(random_opaque(rng))
-        where = (*(rng.uniform(-0.05, 0.05, 1) * size), top + thick / 2, 0.0)
+        where = (rng.uniform(-0.05, 0.05) * size, top + thick / 2, 0)
         sizes = (size * rng.uniform(0.6, 0.9), thick, size * rng.uniform(0.45, 0.65))
         parts.append(box(where, sizes, material, rng.uniform(-25, 25)))
         top += thick
@@ -207,10 +198,9 @@ def _table(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     width, depth = rng.uniform(0.6, 1.8), rng.uniform(0.5, 1.0)
     parts = [box((0, height - thick / 2, 0), (width, thick, depth), top)]
     leg = rng.uniform(0.02, 0.08)
-    for x in (-1, 1):
-        for z in (-1, 1):
-            foot = (x * (width / 2 - leg), (height - thick) / 2, z * (depth / 2 - leg))
-            parts.append(box(foot, (leg, height - thick, leg), legs))
+    for x, z in product((-1, 1), repeat=2):
+        foot = (x * (width / 2 - leg), (height - thick) / 2, z * (depth / 2 - leg))
+        parts.append(box(foot, (leg, height - thick, leg), legs))
     return parts, math.hypot(width, depth) / 2, height
 
 
@@ -218,9 +208,8 @@ def _chair(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     wood, seat = _any_opaque(builder, rng), _any_opaque(builder, rng)
     back = rng.uniform(0.8, 1.15)
     parts = [box((0, 0.45, 0), (0.44, 0.04, 0.44), seat)]
-    for x in (-0.2, 0.2):
-        parts.append(rod((x, 0, 0.2), (x, 0.45, 0.2), 0.018, wood))
-        parts.append(rod((x, 0, -0.2), (x, back, -0.2), 0.018, wood))
+    for x, (z, top) in product((-0.2, 0.2), ((0.2, 0.45), (-0.2, back))):
+        parts.append(rod((x, 0, z), (x, top, z), 0.018, wood))
     bars = int(rng.integers(2, 7))
     if rng.random() < 0.5:
         parts.extend(box((0, 0.55 + (back - 0.6) * n / bars, -0.2), (0.4, 0.04, 0.02), wood) for n in range(bars))
@@ -262,8 +251,7 @@ def _sofa(builder: SceneBuilder, rng: Rng, _: float) -> Piece:
     parts = [
         box((0, 0.22, 0), (width, 0.36, 0.8), cloth),
         box((0, 0.55, -0.32), (width, 0.6, 0.18), cloth, tilt=-8),
-        box((-width / 2, 0.32, 0), (0.16, 0.55, 0.8), cloth),
-        box((width / 2, 0.32, 0), (0.16, 0.55, 0.8), cloth),
+        *(box((x, 0.32, 0), (0.16, 0.55, 0.8), cloth) for x in (-width / 2, width / 2)),
     ]
     for _cushion in range(int(rng.integers(0, 4))):
         cushion = builder.material(random_opaque(rng, textured=0.7))
@@ -281,8 +269,8 @@ def _stairs(builder: SceneBuilder, rng: Rng, height: float) -> Piece:
         z, top = (step - steps / 2 + 0.5) * tread, rise * (step + 1)
         parts.append(box((0, top / 2, z), (width, top, tread), stone))
         parts.append(rod((width / 2, top, z), (width / 2, top + 0.7, z), 0.012, rail))
-    ends = [(width / 2, rise * n + 0.7, (n - steps / 2 - 0.5) * tread) for n in (1, steps)]
-    parts.append(rod(ends[0], ends[1], 0.025, rail))
+    start, end = ((width / 2, rise * n + 0.7, (n - steps / 2 - 0.5) * tread) for n in (1, steps))
+    parts.append(rod(start, end, 0.025, rail))
     return parts, steps * tread / 2 + 0.2, 0.0
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import colorsys
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.builder import Part, SceneBuilder, Vector, ball, box, drum, plate, rgb, rod, rotate, sheet
 from mcdenoise.scenes.random.materials import diffuse, random_metal, random_opaque
-from mcdenoise.scenes.random.textures import Color, Rng
+from mcdenoise.scenes.random.textures import Color, Rng, log_uniform
 
 Point = tuple[float, float, float]
+Limits = tuple[float, float]
 _SKY_ROWS = 128
 
 
@@ -29,9 +32,8 @@ def sky(rng: Rng, level: float, sun: Array | None, sun_ratio: float) -> Array:
     polar = (np.arange(rows) + 0.5)[:, None] / rows * math.pi
     azimuth = (np.arange(columns) + 0.5)[None] / columns * 2 * math.pi
     up = np.cos(polar)
-    direction = np.stack(
-        np.broadcast_arrays(np.sin(azimuth) * np.sin(polar), up, -np.cos(azimuth) * np.sin(polar)), axis=-1
-    )
+    ways = np.sin(azimuth) * np.sin(polar), up, -np.cos(azimuth) * np.sin(polar)
+    direction = np.stack(np.broadcast_arrays(*ways), axis=-1)
     zenith = np.array(colorsys.hsv_to_rgb(rng.uniform(0.5, 0.65), rng.uniform(0, 0.75), 1))
     horizon = np.array(colorsys.hsv_to_rgb(rng.uniform(0.02, 0.15), rng.uniform(0, 0.6), rng.uniform(0.6, 2.2)))
     height = np.clip(up, 0, 1)[..., None] ** rng.uniform(0.3, 0.8)
@@ -92,7 +94,7 @@ def studio(rng: Rng, level: float) -> Array:
 def light_color(rng: Rng) -> Color:
     """A color from candle light to cold daylight, sometimes saturated."""
     if rng.random() < 0.15:
-        color = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0.4, 0.95)), 1)
+        color = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.4, 0.95), 1)
     else:
         warmth = rng.uniform(-0.35, 0.7)
         color = (1.0, 1 - 0.45 * max(warmth, 0) - 0.15 * max(-warmth, 0), 1 - max(warmth, 0))
@@ -102,62 +104,31 @@ def light_color(rng: Rng) -> Color:
     return color[0] / mean, max(color[1], 0.02) / mean, max(color[2], 0.02) / mean
 
 
+def daylight(rng: Rng, sunny: float, level: Limits, ratio: Limits) -> tuple[float, Array | None, float]:
+    """Level, sun and ratio of a :func:`sky`, from a sun's probability and the limits of the level and of log ratio."""
+    sun = sun_direction(rng) if rng.random() < sunny else None
+    return rng.uniform(*level), sun, float(np.exp(rng.uniform(*ratio)))
+
+
 def add_lamps(builder: SceneBuilder, rng: Rng, count: int, brightness: float) -> None:
     """Add hanging, standing and hidden lamps to a room; together they light its surfaces to about ``brightness``."""
     low, high = builder.low, builder.high
-    width, height, depth = high - low
-    flux = brightness * math.pi * 2 * (width * height + height * depth + depth * width) * 0.5
+    width, _, depth = high - low
+    flux = brightness * math.pi * builder.surface() * 0.5
     for fraction in rng.dirichlet(np.full(count, 1.5)):
-        power = float(flux * fraction)
-        kind = rng.choice(
-            ["panel", "tube", "bulb", "standing", "cove", "spot", "point", "chandelier"],
-            p=[0.24, 0.1, 0.2, 0.14, 0.1, 0.1, 0.04, 0.08],
-        )
-        x, z = (float(rng.uniform(low[axis] + 0.15 * s, high[axis] - 0.15 * s)) for axis, s in ((0, width), (2, depth)))
-        color = light_color(rng)
-        ceiling = float(high[1])
-        if kind == "panel":
-            half_size = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2))
-            _panel(builder, (x, ceiling - 0.02, z), (float(half_size[0]), float(half_size[1])), power, color)
-        elif kind == "tube":
-            _panel(builder, (x, ceiling - 0.1, z), (0.03, 0.3 * float(depth) / 2), power, color)
-        elif kind == "bulb":
-            _pendant(builder, rng, (x, ceiling, z), float(height), power, color)
-        elif kind == "standing":
-            _standing(builder, rng, (x, float(low[1]), z), float(height), power, color)
-        elif kind == "cove":
-            _cove(builder, rng, power, color)
-        elif kind == "chandelier":
-            _chandelier(builder, rng, (x, ceiling, z), power, color)
-        else:
-            point = np.array((x, ceiling - 0.15, z))
-            target = np.array((x, low[1], z)) + rng.uniform(-1, 1, 3) * (0.3 * width, 0, 0.3 * depth)
-            add_spot(builder, rng, point, target, power, color, narrow=kind == "spot")
-
-
-def add_spot(
-    builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power: float, color: Color, narrow: bool
-) -> None:
-    """A spot light directed at a target, or a point light."""
-    if not narrow:
-        intensity = scaled(color, power / (4 * math.pi))
-        builder.add_light({"type": "point", "position": origin.tolist(), "intensity": rgb(intensity)})
-        return
-    cutoff = float(rng.uniform(15, 55))
-    solid = 2 * math.pi * (1 - math.cos(math.radians(cutoff)))
-    intensity = scaled(color, power / solid * 0.5)
-    pose = _facing(origin, target, (0.0, 0.0, 1.0))
-    builder.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": rgb(intensity)})
+        kind = rng.choice(list(_LAMPS), p=[chance for _, chance in _LAMPS.values()])
+        x, z = (rng.uniform(low[axis] + 0.15 * s, high[axis] - 0.15 * s) for axis, s in ((0, width), (2, depth)))
+        _LAMPS[kind][0](builder, rng, (x, float(high[1]), z), float(flux * fraction), light_color(rng))
 
 
 def softbox(builder: SceneBuilder, rng: Rng, origin: Array, target: Array, power: float) -> None:
     """An emitting rectangle or ball that faces a target."""
-    color, size = light_color(rng), float(np.exp(rng.uniform(math.log(0.03), math.log(0.6))))
+    color, size = light_color(rng), log_uniform(rng, 0.03, 0.6)
     black = builder.material(diffuse((0.02, 0.02, 0.02)))
     if rng.random() < 0.4:
         builder.add([bulb(origin, size / 2, black, power, color)])
         return
-    half_size = (size, size * float(rng.uniform(0.3, 1)))
+    half_size = (size, size * rng.uniform(0.3, 1))
     builder.add([_glowing(origin, half_size, black, power, color, _facing(origin, target, (0.0, 1.0, 0.0)))])
 
 
@@ -178,43 +149,46 @@ def _glowing(
     return sheet(center, half, material, rotation, scaled(color, power / (math.pi * 4 * half[0] * half[1])))
 
 
-def _panel(builder: SceneBuilder, center: Point, half_size: tuple[float, float], power: float, color: Color) -> None:
+def _panel(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color, *, tube: bool = False) -> None:
+    """A flat light or a tube, under a white board."""
+    width, _, depth = builder.high - builder.low
+    x, y, z = hook[0], hook[1] - (0.1 if tube else 0.02), hook[2]
+    wide, deep = 0.03, 0.3 * float(depth) / 2
+    if not tube:
+        wide, deep = np.exp(rng.uniform(math.log(0.04), math.log(0.5 * min(width, depth) / 2), 2)).tolist()
     white = builder.material(diffuse((0.8, 0.8, 0.8)))
-    frame = (center[0], center[1] + 0.012, center[2])
-    builder.add([_glowing(center, half_size, white, power, color, rotate("x", 90))])
-    builder.add([box(frame, (2 * half_size[0] + 0.06, 0.02, 2 * half_size[1] + 0.06), white)])
+    glow = _glowing((x, y, z), (wide, deep), white, power, color, rotate("x", 90))
+    builder.add([glow, box((x, y + 0.012, z), (2 * wide + 0.06, 0.02, 2 * deep + 0.06), white)])
 
 
-def _pendant(builder: SceneBuilder, rng: Rng, hook: Point, height: float, power: float, color: Color) -> None:
+def _pendant(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color) -> None:
     """A bulb on a cord, bare or under a shade that blocks the light to the ceiling."""
-    radius = float(np.exp(rng.uniform(math.log(0.02), math.log(0.2))))
-    y = hook[1] - float(rng.uniform(0.15, 0.45)) * height
-    center = (hook[0], y, hook[2])
+    x, ceiling, z = hook
+    radius = log_uniform(rng, 0.02, 0.2)
+    y = ceiling - rng.uniform(0.15, 0.45) * float(ceiling - builder.low[1])
     cord = builder.material(diffuse((0.05, 0.05, 0.05)))
-    builder.add([rod((hook[0], y + radius, hook[2]), hook, 0.006, cord)])
-    builder.add([bulb(center, radius, cord, power, color)])
-    builder.points.append(np.array(center))
+    builder.add(
+        [rod((x, y + radius, z), hook, 0.006, cord), bulb((x, y, z), radius, cord, power, color)], look=(x, y, z)
+    )
     if rng.random() < 0.4:
         shade = builder.material(random_opaque(rng))
-        wide = radius * float(rng.uniform(1.3, 2.5))
-        top = (hook[0], y + 1.5 * radius, hook[2])
-        builder.add([rod((hook[0], y - radius, hook[2]), top, wide, shade), plate(top, wide, shade)])
+        wide, top = radius * rng.uniform(1.3, 2.5), (x, y + 1.5 * radius, z)
+        builder.add([rod((x, y - radius, z), top, wide, shade), plate(top, wide, shade)])
 
 
-def _standing(builder: SceneBuilder, rng: Rng, foot: Point, height: float, power: float, color: Color) -> None:
+def _standing(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color) -> None:
     metal = builder.material(random_metal(rng))
-    x, y, z = foot
-    top = float(rng.uniform(0.35, 0.7)) * height
-    radius = float(rng.uniform(0.04, 0.15))
-    builder.add([*drum(foot, 0.03, 0.15, metal), rod((x, y, z), (x, y + top - radius, z), 0.015, metal)])
-    builder.add([bulb((x, y + top, z), radius, metal, power, color)])
-    builder.points.append(np.array((x, y + top, z)))
+    x, y, z = hook[0], float(builder.low[1]), hook[2]
+    top = y + rng.uniform(0.35, 0.7) * float(hook[1] - y)
+    radius = rng.uniform(0.04, 0.15)
+    builder.add([*drum((x, y, z), 0.03, 0.15, metal), rod((x, y, z), (x, top - radius, z), 0.015, metal)])
+    builder.add([bulb((x, top, z), radius, metal, power, color)], look=(x, top, z))
     if rng.random() < 0.5:
         shade = builder.material(random_opaque(rng))
-        builder.add([rod((x, y + top - 1.4 * radius, z), (x, y + top + 1.4 * radius, z), 1.8 * radius, shade)])
+        builder.add([rod((x, top - 1.4 * radius, z), (x, top + 1.4 * radius, z), 1.8 * radius, shade)])
 
 
-def _cove(builder: SceneBuilder, rng: Rng, power: float, color: Color) -> None:
+def _cove(builder: SceneBuilder, rng: Rng, _: Point, power: float, color: Color) -> None:
     """A light strip behind a board under the ceiling, so that everything below is lit indirectly."""
     low, high = builder.low, builder.high
     side = int(rng.choice([-1, 1]))
@@ -222,22 +196,48 @@ def _cove(builder: SceneBuilder, rng: Rng, power: float, color: Color) -> None:
     y, z = float(high[1]) - 0.35, float(low[2] + high[2]) / 2
     length = 0.85 * float(high[2] - low[2])
     white = builder.material(diffuse((0.8, 0.8, 0.8)))
-    builder.add([_glowing((x, y + 0.03, z), (0.04, length / 2), white, 1.5 * power, color, rotate("x", -90))])
-    builder.add([box((x, y, z), (0.2, 0.03, length), white)])
-    builder.add([box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)])
+    glow = _glowing((x, y + 0.03, z), (0.04, length / 2), white, 1.5 * power, color, rotate("x", -90))
+    rim = box((x - side * 0.1, y + 0.06, z), (0.02, 0.15, length), white)
+    builder.add([glow, box((x, y, z), (0.2, 0.03, length), white), rim])
 
 
 def _chandelier(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color) -> None:
     metal = builder.material(random_metal(rng))
-    bulbs, radius = 3, float(rng.uniform(0.2, 0.5))
-    y = hook[1] - float(rng.uniform(0.4, 0.8))
-    builder.add([rod((hook[0], y, hook[2]), hook, 0.012, metal)])
+    bulbs, radius = 3, rng.uniform(0.2, 0.5)
+    middle = (hook[0], hook[1] - rng.uniform(0.4, 0.8), hook[2])
+    builder.add([rod(middle, hook, 0.012, metal)], look=middle)
     for number in range(bulbs):
         angle = 2 * math.pi * number / bulbs
-        end = (hook[0] + radius * math.cos(angle), y + 0.08, hook[2] + radius * math.sin(angle))
-        builder.add([rod((hook[0], y, hook[2]), end, 0.01, metal)])
-        builder.add([bulb((end[0], end[1] + 0.05, end[2]), 0.04, metal, power / bulbs, color)])
-    builder.points.append(np.array((hook[0], y, hook[2])))
+        x, y, z = hook[0] + radius * math.cos(angle), middle[1] + 0.08, hook[2] + radius * math.sin(angle)
+        builder.add([rod(middle, (x, y, z), 0.01, metal), bulb((x, y + 0.05, z), 0.04, metal, power / bulbs, color)])
+
+
+def _spot(builder: SceneBuilder, rng: Rng, hook: Point, power: float, color: Color, *, narrow: bool = True) -> None:
+    """A spot light directed at the floor, or a point light."""
+    width, _, depth = builder.high - builder.low
+    origin = np.array((hook[0], hook[1] - 0.15, hook[2]))
+    target = np.array((hook[0], builder.low[1], hook[2])) + rng.uniform(-1, 1, 3) * (0.3 * width, 0, 0.3 * depth)
+    if not narrow:
+        intensity = rgb(scaled(color, power / (4 * math.pi)))
+        builder.add_light({"type": "point", "position": origin.tolist(), "intensity": intensity})
+        return
+    cutoff = rng.uniform(15, 55)
+    intensity = rgb(scaled(color, power / (2 * math.pi * (1 - math.cos(math.radians(cutoff)))) * 0.5))
+    pose = _facing(origin, target, (0.0, 0.0, 1.0))
+    builder.add_light({"type": "spot", "to_world": pose, "cutoff_angle": cutoff, "intensity": intensity})
+
+
+# Lamps, which hang from a hook on the ceiling or stand below it, and how often they are.
+_LAMPS: dict[str, tuple[Callable[[SceneBuilder, Rng, Point, float, Color], None], float]] = {
+    "panel": (_panel, 0.24),
+    "tube": (partial(_panel, tube=True), 0.1),
+    "bulb": (_pendant, 0.2),
+    "standing": (_standing, 0.14),
+    "cove": (_cove, 0.1),
+    "spot": (_spot, 0.1),
+    "point": (partial(_spot, narrow=False), 0.04),
+    "chandelier": (_chandelier, 0.08),
+}
 
 
 def bulb(center: Vector, radius: float, material: dict[str, str], power: float, color: Color) -> Part:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.textures import Color, Rng, leaf_mask, random_color, texture
+from mcdenoise.scenes.random.textures import Color, Rng, leaf_mask, log_uniform, random_color, texture
 
 Bsdf = dict[str, Any]
 # Reflectance of each metal at normal incidence, linear sRGB.
@@ -68,7 +68,7 @@ def foliage(rng: Rng, color: Color) -> Bsdf:
 
 def random_metal(rng: Rng) -> Bsdf:
     """A rough metal: untinted, tinted or brushed."""
-    material, alpha = str(rng.choice(list(METALS))), float(np.exp(rng.uniform(np.log(0.02), np.log(0.4))))
+    material, alpha = str(rng.choice(list(METALS))), log_uniform(rng, 0.02, 0.4)
     if rng.random() < 0.25:
         pattern = texture(rng).mean(axis=-1, keepdims=True)
         return rough_metal(material, np.clip(alpha * (0.5 + 2 * pattern), 0.02, 0.5))
@@ -85,7 +85,7 @@ def random_opaque(rng: Rng, repeat: tuple[float, float] = (1, 1), textured: floa
         return diffuse(look, repeat)
     if kind < 0.7:
         return lacquer(look, repeat)
-    return rough_plastic(look, float(np.exp(rng.uniform(np.log(0.03), np.log(0.4)))), repeat)
+    return rough_plastic(look, log_uniform(rng, 0.03, 0.4), repeat)
 
 
 def random_material(rng: Rng) -> Bsdf:
@@ -97,7 +97,7 @@ def random_material(rng: Rng) -> Bsdf:
         return random_metal(rng)
     if kind < 0.88:
         return mirror(str(rng.choice(list(METALS))))
-    return glass(float(rng.uniform(1.3, 1.75)))
+    return glass(rng.uniform(1.3, 1.75))
 
 
 def _two_sided(bsdf: Bsdf) -> Bsdf:

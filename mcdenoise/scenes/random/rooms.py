@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import SceneBuilder, ball, box, place, rod, sheet
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, ball, box, place, rod, sheet
 from mcdenoise.scenes.random.furniture import curtain, decorate, furniture, glass_block, ornament, picture_frame
-from mcdenoise.scenes.random.lights import sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.lights import daylight, sky, softbox, studio
 from mcdenoise.scenes.random.materials import (
     Bsdf,
     diffuse,
@@ -19,7 +19,7 @@ from mcdenoise.scenes.random.materials import (
     rough_metal,
     rough_plastic,
 )
-from mcdenoise.scenes.random.textures import Color, Rng, texture, wall_color
+from mcdenoise.scenes.random.textures import Color, Rng, log_uniform, texture, wall_color
 
 # A room with more shapes than this gets no more furniture.
 _ENOUGH_SHAPES = 290
@@ -41,16 +41,14 @@ def still_life(rng: Rng) -> SceneBuilder:
         if rng.random() < 0.5:
             builder.add([box((-1.9, 1.5, 0), (0.1, 3.2, 6), builder.material(random_opaque(rng, (2, 1))))])
             builder.low[0] = -1.8
-    decorate(builder, rng, (0, 0, 0), float(rng.uniform(0.6, 1.1)), int(rng.integers(6, 16)))
+    decorate(builder, rng, (0, 0, 0), rng.uniform(0.6, 1.1), int(rng.integers(6, 16)))
     for _ in range(int(rng.integers(0, 4))):
-        size = float(rng.uniform(0.15, 0.6))
+        size = rng.uniform(0.15, 0.6)
         x, z = rng.uniform(-0.7, 0.7, 2)
-        builder.add(glass_block(builder, rng, size), place((x, 0, z)), movable=True)
-        builder.points.append(np.array((x, size / 2, z)))
+        builder.add(glass_block(builder, rng, size), place((x, 0, z)), movable=True, look=(0, size / 2, 0))
     light = rng.random()
     if light < 0.45:
-        sun = sun_direction(rng) if rng.random() < 0.7 else None
-        builder.set_sky(sky(rng, float(rng.uniform(0.3, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
+        builder.set_sky(sky(rng, *daylight(rng, 0.7, (0.3, 1), (-0.7, 1.8))))
     elif light < 0.6:
         builder.set_sky(studio(rng, 0.5))
     if light > 0.45:
@@ -58,7 +56,7 @@ def still_life(rng: Rng) -> SceneBuilder:
         for _ in range(lights):
             angle, away = rng.uniform(0, 2 * math.pi), rng.uniform(0.8, 2.0)
             origin = np.array((away * math.cos(angle), rng.uniform(0.8, 2.4), away * math.sin(angle)))
-            softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(8, 40)) / lights)
+            softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), rng.uniform(8, 40) / lights)
     return builder
 
 
@@ -100,8 +98,7 @@ def colonnade(rng: Rng) -> SceneBuilder:
         _put_on_floor(builder, rng, [])
     for _ in range(6):
         builder.points.append(rng.uniform(builder.low * (1, 1, 0.9), builder.high * (1, 0.7, 0.9)))
-    sun = sun_direction(rng) if rng.random() < 0.75 else None
-    builder.set_sky(sky(rng, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
+    builder.set_sky(sky(rng, *daylight(rng, 0.75, (0.6, 1.8), (-0.5, 1.8))))
     return builder
 
 
@@ -113,22 +110,20 @@ def light_experiment(rng: Rng) -> SceneBuilder:
     metal = rng.random() < 0.6
     plates, lights = int(rng.integers(3, 6)), int(rng.integers(3, 6))
     for number in range(plates):
-        alpha = float(np.exp(rng.uniform(math.log(0.02), math.log(0.4))))
+        alpha = log_uniform(rng, 0.02, 0.4)
         look = texture(rng) if rng.random() < 0.3 else wall_color(rng)
         material = builder.material(rough_metal("Al", alpha) if metal else _coat(rng, look, alpha))
         angle = 12 + 50 * number / plates
         center = (0, 0.15 + 0.7 * (1 - math.cos(math.radians(angle))) * 1.6, 0.9 - 0.55 * number)
-        builder.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)])
-        builder.points.append(np.array(center))
+        builder.add([box(center, (3.6, 0.03, 0.45), material, tilt=angle)], look=center)
     black = builder.material(diffuse((0.02, 0.02, 0.02)))
     for number, radius in enumerate(np.geomspace(0.02, 0.35, lights)):
         x = (number - (lights - 1) / 2) * 3.4 / lights
         power = 6 * float(np.exp(rng.uniform(-0.7, 0.7))) / lights
-        radiance = np.array(wall_color(rng)) * power / (math.pi * radius**2)
-        glow = (float(radiance[0]), float(radiance[1]), float(radiance[2]))
-        builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), float(radius), black, glow)], movable=True)
+        red, green, blue = (channel * power / (math.pi * radius**2) for channel in wall_color(rng))
+        builder.add([ball((x, rng.uniform(1.6, 2.1), -1.2), radius, black, (red, green, blue))], movable=True)
     # Without this light the far corners would be black.
-    builder.set_sky(studio(rng, float(rng.uniform(0.03, 0.2))))
+    builder.set_sky(studio(rng, rng.uniform(0.03, 0.2)))
     for _ in range(int(rng.integers(1, 5))):
         where = (rng.uniform(-1.8, 1.8), 0, rng.uniform(1.2, 2.2))
         builder.add(ornament(builder, rng, rng.uniform(0.2, 0.5)), place(where, rng.uniform(0, 360)), movable=True)
@@ -156,7 +151,7 @@ def empty_room(rng: Rng) -> SceneBuilder:
         builder.add([rod((x, 0, z), (x, height, z), rng.uniform(0.06, 0.2), pillar)])
     if rng.random() < 0.5:
         rug = builder.material(random_opaque(rng, textured=0.95))
-        where = (*(rng.uniform(-0.15, 0.15, 1) * width), 0.006, 0.0)
+        where = (rng.uniform(-0.15, 0.15) * width, 0.006, 0)
         builder.add([box(where, (width * rng.uniform(0.3, 0.7), 0.012, depth * rng.uniform(0.3, 0.6)), rug)])
     return builder
 
@@ -165,12 +160,7 @@ def _wall_frame(builder: SceneBuilder, wall: int) -> tuple[Array, float, float]:
     """Placement of a wall (+z points into the room, y = 0 is the floor), its length and its height."""
     width, height, depth = builder.high - builder.low
     position = [(0, 0, -depth / 2), (-width / 2, 0, 0), (0, 0, depth / 2), (width / 2, 0, 0)][wall]
-    return place(position, (0, 90, 180, -90)[wall]), float(width if wall % 2 == 0 else depth), float(height)
-
-
-def outwards(wall: int) -> float:
-    """Azimuth of a wall's outward direction, degrees from +z towards +x."""
-    return (180.0, -90.0, 0.0, 90.0)[wall]
+    return place(position, TURNS[wall]), float(width if wall % 2 == 0 else depth), float(height)
 
 
 def closed_wall(builder: SceneBuilder, rng: Rng, wall: int) -> None:
@@ -190,8 +180,7 @@ def closed_wall(builder: SceneBuilder, rng: Rng, wall: int) -> None:
     builder.add(parts, frame)
     for _ in range(int(rng.integers(0, 4))):
         where = place((rng.uniform(-0.4, 0.4) * length, rng.uniform(0.45, 0.75) * height, 0.0))
-        builder.add(picture_frame(builder, rng), frame @ where)
-        builder.points.append((frame @ where)[:3, 3])
+        builder.add(picture_frame(builder, rng), frame @ where, look=(0, 0, 0))
 
 
 def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | None = None) -> float:
@@ -206,9 +195,9 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | 
     frame, length, height = _wall_frame(builder, wall)
     count = int(rng.integers(1, 4)) if length > 3 else 1
     sill = float(rng.choice([0.0, rng.uniform(0.3, 1.1)], p=[0.2, 0.8]))
-    top = float(rng.uniform(0.75, 0.95)) * height
+    top = rng.uniform(0.75, 0.95) * height
     pitch = length / count
-    wide = pitch * float(rng.uniform(0.25, 0.85))
+    wide = pitch * rng.uniform(0.25, 0.85)
     surface = builder.material(_coat(rng, wall_color(rng)))
     bar = builder.material(diffuse(wall_color(rng)))
     over = height - top
@@ -233,20 +222,19 @@ def wall_with_windows(builder: SceneBuilder, rng: Rng, wall: int, glow: Color | 
             parts.append(box((x, sill + tall * (n + 1) / (rows + 1), -0.12), (wide, 0.04, 0.05), bar))
         if glow is not None:
             black = builder.material(diffuse((0.02, 0.02, 0.02)))
-            parts.append(sheet((x, sill + tall / 2, -_WALL - 0.02), (wide / 2, tall / 2), black, np.eye(4), glow))
+            parts.append(sheet((x, sill + tall / 2, -_WALL - 0.02), (wide / 2, tall / 2), black, radiance=glow))
         if glazed:
-            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
+            parts.append(sheet((x, sill + tall / 2, -0.14), (wide / 2, tall / 2), builder.material(pane())))
         if dressing == "blinds":
             slats = int(np.clip(tall / 0.08, 6, 24))
-            tilt, slat = float(rng.uniform(-50, 50)), (wide, 0.004, tall / slats * 0.9)
+            tilt, slat = rng.uniform(-50, 50), (wide, 0.004, tall / slats * 0.9)
             parts += [box((x, sill + tall * (n + 0.5) / slats, -0.05), slat, bar, 0, tilt) for n in range(slats)]
         elif dressing == "curtains":
-            part = wide * float(rng.uniform(0.2, 0.45))
+            part = wide * rng.uniform(0.2, 0.45)
             for side in (-1, 1):
                 hook = place((x + side * (wide - part) / 2, top + 0.1, 0.12))
                 builder.add(curtain(builder, rng, part, top if rng.random() < 0.5 else tall + 0.2), frame @ hook)
-    builder.add(parts, frame)
-    builder.points.append((frame @ np.array((middles[0], (sill + top) / 2, 0.3, 1.0)))[:3])
+    builder.add(parts, frame, look=(middles[0], (sill + top) / 2, 0.3))
     return count * wide * (top - sill) * (0.5 if dressing != "none" else 1)
 
 
@@ -269,35 +257,26 @@ def _put_on_floor(builder: SceneBuilder, rng: Rng, taken: list[tuple[float, floa
     low, high = builder.low, builder.high
     parts, radius, top = furniture(builder, rng, float(high[1]))
     for _ in range(12):
-        x, z = (
-            float(rng.uniform(low[axis] + radius, max(high[axis] - radius, low[axis] + radius + 0.01)))
-            for axis in (0, 2)
-        )
-        turn = float(rng.uniform(0, 360)) if rng.random() < 0.4 else 90 * float(rng.integers(4))
+        lowest = low + radius
+        x, z = (rng.uniform(lowest[axis], max(high[axis] - radius, lowest[axis] + 0.01)) for axis in (0, 2))
+        turn = rng.uniform(0, 360) if rng.random() < 0.4 else 90 * float(rng.integers(4))
         if rng.random() < 0.6:
             wall = int(rng.integers(4))
-            turn = (0.0, 90.0, 180.0, -90.0)[wall]
-            x, z = (
-                (x, low[2] + 0.6 * radius),
-                (low[0] + 0.6 * radius, z),
-                (x, high[2] - 0.6 * radius),
-                (high[0] - 0.6 * radius, z),
-            )[wall]
+            turn = TURNS[wall]
+            first, last = low + 0.6 * radius, high - 0.6 * radius
+            x, z = ((x, first[2]), (first[0], z), (x, last[2]), (last[0], z))[wall]
         if all(math.hypot(x - a, z - b) > radius + c for a, b, c in taken):
             taken.append((x, z, radius))
-            names = builder.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
-            lows, highs = builder.boxes()
-            middle = (lows[-len(names) :].min(axis=0) + highs[-len(names) :].max(axis=0)) / 2
-            builder.points.append(middle)
+            builder.add(parts, place((x, 0, z), turn), movable=len(parts) < 12 and top == 0)
+            lows, highs = (corners[-len(parts) :] for corners in builder.boxes())
+            builder.points.append((lows.min(axis=0) + highs.max(axis=0)) / 2)
             if top > 0:
                 decorate(builder, rng, (x, top, z), 0.6 * radius, int(rng.integers(1, 5)))
             return
 
 
-def _coat(
-    rng: Rng, look: tuple[float, float, float] | Array, alpha: float = 0.0, repeat: tuple[float, float] = (1, 1)
-) -> Bsdf:
+def _coat(rng: Rng, look: Color | Array, alpha: float = 0.0, repeat: tuple[float, float] = (1, 1)) -> Bsdf:
     """Paint for walls: diffuse, or glossy with the given roughness."""
     if alpha == 0 and rng.random() < 0.7:
         return diffuse(look, repeat)
-    return rough_plastic(look, alpha or float(rng.uniform(0.1, 0.4)), repeat)
+    return rough_plastic(look, alpha or rng.uniform(0.1, 0.4), repeat)

@@ -12,10 +12,10 @@ import math
 import numpy as np
 
 from mcdenoise.data.camera_path import Array
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, ball, box, drum, place, rod, rotate, sheet
 from mcdenoise.scenes.random.furniture import glass_block, ornament
 from mcdenoise.scenes.random.materials import Bsdf, diffuse, glass, lacquer, mirror, pane, random_metal, rough_plastic
-from mcdenoise.scenes.random.textures import Rng, planks, texture
+from mcdenoise.scenes.random.textures import Rng, log_uniform, planks, texture
 
 # Minimum area in square metres of a floor, a wall or a table top.
 _LARGE = 0.3
@@ -29,8 +29,8 @@ def shine(builder: SceneBuilder, rng: Rng) -> None:
     builder.change_materials(lambda name, bsdf: _coated(rng, bsdf, areas.get(name, 0.0) > _LARGE))
     adders = [_wall_mirror, _wall_mirror, _vitrine, _standing_pane, _jewels, _lacquered_box, _glass_picture]
     for _ in range(int(rng.integers(1, 5))):
-        point = adders[int(rng.integers(len(adders)))](builder, rng)
-        builder.points.extend([point] * _WEIGHT)
+        adders[int(rng.integers(len(adders)))](builder, rng)
+        builder.points += [builder.points[-1]] * (_WEIGHT - 1)
 
 
 def _coated(rng: Rng, bsdf: Bsdf, large: bool) -> Bsdf:
@@ -58,14 +58,13 @@ def _coated(rng: Rng, bsdf: Bsdf, large: bool) -> Bsdf:
     if kind < 0.62:
         return lacquer(image, tiling, nonlinear=bool(rng.random() < 0.7))
     if kind < 0.93:
-        alpha = float(np.exp(rng.uniform(math.log(0.01), math.log(0.3))))
-        return rough_plastic(image, alpha, tiling)
+        return rough_plastic(image, log_uniform(rng, 0.01, 0.3), tiling)
     return random_metal(rng)
 
 
 def _contrast(rng: Rng, image: Array) -> Array:
     """Change the contrast of a texture, from nearly none to black and white."""
-    factor = float(np.exp(rng.uniform(math.log(0.12), math.log(3))))
+    factor = log_uniform(rng, 0.12, 3)
     mean = image.mean(axis=(0, 1))
     return np.asarray(np.clip(mean + factor * (image - mean), 0.01, 0.9))
 
@@ -80,36 +79,31 @@ def _wall_place(builder: SceneBuilder, rng: Rng) -> tuple[Array, float, float]:
     where[along] += rng.uniform(-0.35, 0.35) * width
     where[across] = (low if wall < 2 else high)[across]
     where[1] = rng.uniform(0.4, 0.6) * height
-    return place(where, (0, 90, 180, -90)[wall]), width, height
+    return place(where, TURNS[wall]), width, height
 
 
-def _wall_mirror(builder: SceneBuilder, rng: Rng) -> Array:
+def _wall_mirror(builder: SceneBuilder, rng: Rng) -> None:
     """A mirror on a wall, sometimes slightly rough or tilted, with or without a frame."""
     frame, width, height = _wall_place(builder, rng)
     half_size = rng.uniform(0.2, 0.5) * min(width, 3.0), rng.uniform(0.25, 0.42) * min(height, 2.6)
     silver = mirror(str(rng.choice(["Ag", "Al"]))) if rng.random() < 0.75 else random_metal(rng)
-    tilt = rotate("x", float(rng.uniform(-4, 8)) if rng.random() < 0.4 else 0.0)
+    tilt = rotate("x", rng.uniform(-4, 8) if rng.random() < 0.4 else 0.0)
     parts = [sheet((0, 0, 0.06), half_size, builder.material(silver), tilt)]
     if rng.random() < 0.7:
         rim = builder.material(lacquer(texture(rng), nonlinear=True) if rng.random() < 0.5 else random_metal(rng))
         parts.append(box((0, 0, 0.01), (2 * half_size[0] + 0.1, 2 * half_size[1] + 0.1, 0.02), rim))
         for side in (-1, 1):
             parts.append(box((side * (half_size[0] + 0.03), 0, 0.05), (0.06, 2 * half_size[1] + 0.1, 0.08), rim))
-    builder.add(parts, frame)
-    return np.asarray(frame[:3, 3])
+    builder.add(parts, frame, look=(0, 0, 0))
 
 
-def _glass_picture(builder: SceneBuilder, rng: Rng) -> Array:
+def _glass_picture(builder: SceneBuilder, rng: Rng) -> None:
     """A large textured panel on a wall behind glass."""
     frame, width, height = _wall_place(builder, rng)
     half_size = rng.uniform(0.2, 0.4) * min(width, 3.0), rng.uniform(0.2, 0.4) * min(height, 2.6)
     image = builder.material(diffuse(_contrast(rng, texture(rng))))
-    parts = [
-        sheet((0, 0, 0.03), half_size, image, np.eye(4)),
-        sheet((0, 0, float(rng.uniform(0.05, 0.3))), half_size, builder.material(pane()), np.eye(4)),
-    ]
-    builder.add(parts, frame)
-    return np.asarray(frame[:3, 3])
+    cover = sheet((0, 0, rng.uniform(0.05, 0.3)), half_size, builder.material(pane()))
+    builder.add([sheet((0, 0, 0.03), half_size, image), cover], frame, look=(0, 0, 0))
 
 
 def _spot(builder: SceneBuilder, rng: Rng) -> Array:
@@ -120,27 +114,23 @@ def _spot(builder: SceneBuilder, rng: Rng) -> Array:
     return np.asarray(where)
 
 
-def _standing_pane(builder: SceneBuilder, rng: Rng) -> Array:
+def _standing_pane(builder: SceneBuilder, rng: Rng) -> None:
     """A standing screen of thin or thick glass through which the background is visible."""
-    where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
+    frame = place(_spot(builder, rng), rng.uniform(0, 360))
     wide, tall = rng.uniform(0.4, 1.2), rng.uniform(0.5, 1.0) * min(float(builder.high[1]) - 0.1, 1.9)
     rim = builder.material(random_metal(rng))
-    parts: list[Part] = []
     if rng.random() < 0.7:
-        parts.append(sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane()), np.eye(4)))
+        filling = sheet((0, tall / 2, 0), (wide / 2, tall / 2), builder.material(pane()))
     else:
-        parts.append(box((0, tall / 2, 0), (wide, tall, 0.03), builder.material(glass())))
-    for side in (-1, 1):
-        parts.append(rod((side * wide / 2, 0, 0), (side * wide / 2, tall, 0), 0.015, rim))
-    builder.add(parts, place(where, turn))
-    return np.asarray(where + np.array((0, tall / 2, 0)))
+        filling = box((0, tall / 2, 0), (wide, tall, 0.03), builder.material(glass()))
+    posts = [rod((x, 0, 0), (x, tall, 0), 0.015, rim) for x in (-wide / 2, wide / 2)]
+    builder.add([filling, *posts], frame, look=(0, tall / 2, 0))
 
 
-def _vitrine(builder: SceneBuilder, rng: Rng) -> Array:
+def _vitrine(builder: SceneBuilder, rng: Rng) -> None:
     """Ornaments on a block under a glass box."""
-    where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
-    edge, base = float(rng.uniform(0.3, 0.7)), float(rng.uniform(0.05, 0.8))
-    base = min(base, 0.4 * float(builder.high[1]))
+    frame = place(_spot(builder, rng), rng.uniform(0, 360))
+    edge, base = rng.uniform(0.3, 0.7), min(rng.uniform(0.05, 0.8), 0.4 * builder.high[1])
     block = builder.material(_coated(rng, diffuse(texture(rng)), large=True))
     clear = builder.material(pane())
     parts = [box((0, base / 2, 0), (edge, base, edge), block)]
@@ -149,27 +139,23 @@ def _vitrine(builder: SceneBuilder, rng: Rng) -> Array:
         middle = wall[:3, :3] @ np.array((0, 0, edge / 2)) + (0, base + edge / 2, 0)
         parts.append(sheet(middle, (edge / 2, edge / 2), clear, wall))
     parts.append(sheet((0, base + edge, 0), (edge / 2, edge / 2), clear, rotate("x", -90)))
-    frame = place(where, turn)
-    builder.add(parts, frame)
+    builder.add(parts, frame, look=(0, base + edge / 2, 0))
     builder.add(ornament(builder, rng, 0.8 * edge), frame @ place((0, base + 0.002, 0)))
-    return np.asarray(where + np.array((0, base + edge / 2, 0)))
 
 
-def _jewels(builder: SceneBuilder, rng: Rng) -> Array:
+def _jewels(builder: SceneBuilder, rng: Rng) -> None:
     """Balls, cylinders and blocks of glass, mirror and metal next to each other on a glossy plate."""
     where = _spot(builder, rng)
-    radius, height = float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.02, 0.7))
-    height = min(height, 0.4 * float(builder.high[1]))
+    radius, height = rng.uniform(0.3, 0.6), min(rng.uniform(0.02, 0.7), 0.4 * builder.high[1])
     plate = builder.material(_coated(rng, diffuse(texture(rng)), large=True))
-    frame = place(where, float(rng.uniform(0, 360)))
-    builder.add(drum((0, 0, 0), height, radius, plate), frame)
+    frame = place(where, rng.uniform(0, 360))
+    builder.add(drum((0, 0, 0), height, radius, plate), frame, look=(0, height + 0.1, 0))
     count = int(rng.integers(3, 7))
     for number in range(count):
         angle = 2 * math.pi * number / count
-        size = float(rng.uniform(0.1, 0.35)) * radius * 2
+        size = rng.uniform(0.1, 0.35) * radius * 2
         spot = frame @ place((0.62 * radius * math.cos(angle), height + 0.002, 0.62 * radius * math.sin(angle)))
         kind = rng.random()
-        parts: list[Part]
         if kind < 0.35:
             parts = glass_block(builder, rng, size)
         else:
@@ -181,23 +167,19 @@ def _jewels(builder: SceneBuilder, rng: Rng) -> Array:
             if rng.random() < 0.3:
                 parts = drum((0, 0, 0), size, 0.3 * size, material)
         builder.add(parts, spot, movable=True)
-    return np.asarray(where + np.array((0, height + 0.1, 0)))
 
 
-def _lacquered_box(builder: SceneBuilder, rng: Rng) -> Array:
+def _lacquered_box(builder: SceneBuilder, rng: Rng) -> None:
     """A chest or a low table of dark lacquered wood that reflects the objects on it."""
-    where, turn = _spot(builder, rng), float(rng.uniform(0, 360))
-    wide, deep, tall = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.0), rng.uniform(0.1, 0.7)
-    tall = min(float(tall), 0.4 * float(builder.high[1]))
+    frame = place(_spot(builder, rng), rng.uniform(0, 360))
+    wide, deep, tall = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.0), min(rng.uniform(0.1, 0.7), 0.4 * builder.high[1])
     wood = planks(rng) if rng.random() < 0.7 else texture(rng)
     dark = np.clip(wood * rng.uniform(0.05, 0.5), 0.003, 0.9)
     tiling = (float(rng.integers(1, 4)), float(rng.integers(1, 4)))
     coat = lacquer(dark, tiling, nonlinear=True)
     if rng.random() >= 0.6:
-        coat = rough_plastic(dark, float(rng.uniform(0.02, 0.15)), tiling)
-    frame = place(where, turn)
-    builder.add([box((0, tall / 2, 0), (wide, tall, deep), builder.material(coat))], frame)
+        coat = rough_plastic(dark, rng.uniform(0.02, 0.15), tiling)
+    builder.add([box((0, tall / 2, 0), (wide, tall, deep), builder.material(coat))], frame, look=(0, tall, 0))
     for _ in range(int(rng.integers(1, 4))):
         spot = place((rng.uniform(-0.35, 0.35) * wide, tall, rng.uniform(-0.3, 0.3) * deep), rng.uniform(0, 360))
-        builder.add(ornament(builder, rng, float(rng.uniform(0.12, 0.4))), frame @ spot, movable=True)
-    return np.asarray(where + np.array((0, tall, 0)))
+        builder.add(ornament(builder, rng, rng.uniform(0.12, 0.4)), frame @ spot, movable=True)

@@ -24,9 +24,14 @@ _PAINTS = {
 }
 
 
+def log_uniform(rng: Rng, low: float, high: float) -> float:
+    """A random number whose logarithm is even."""
+    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+
+
 def random_color(rng: Rng) -> Color:
     """A reflectance: neutral, pastel, saturated, dark or bright."""
-    hue = float(rng.random())
+    hue = rng.random()
     kind = str(rng.choice(list(_PAINTS), p=[chance for chance, _, _ in _PAINTS.values()]))
     if kind == "wood":
         hue = rng.uniform(0.04, 0.11)
@@ -39,7 +44,7 @@ def wall_color(rng: Rng) -> Color:
     """A bright paint in most cases, for indirect light; sometimes any color."""
     if rng.random() < 0.25:
         return random_color(rng)
-    red, green, blue = colorsys.hsv_to_rgb(float(rng.random()), float(rng.uniform(0, 0.25)), rng.uniform(0.5, 0.88))
+    red, green, blue = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0, 0.25), rng.uniform(0.5, 0.88))
     return red, green, blue
 
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.render.film import Film
-from mcdenoise.scenes.render.loading import Scene
-from mcdenoise.scenes.render.stage import Stage
+from mcdenoise.scenes.render.loading import Scene, Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, NORMAL, REST, WAVEFRONT, Samples, Tracer
 
 RR_DEPTH, STRATIFIED_PATHS = 5, 16

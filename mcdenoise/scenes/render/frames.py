@@ -68,11 +68,6 @@ class FrameJob:
         """Whether a frame has complete buffers of a noise seed."""
         return has_buffers(noise_seed_folder(self.folder, noise_seed), number, names, self.size)
 
-    def is_finished(self, number: int) -> bool:
-        """Whether all files of a frame exist."""
-        noisy = all(self.has(number, noise_seed, self.noisy) for noise_seed in range(self.noise_seeds))
-        return noisy and self.has(number, 0, self.features) and not self.wants_reference(number)
-
     def reference(self, number: int) -> ReferenceState:
         """What there is of the reference of a frame."""
         return reference_state(reference_file(self.folder, number), self.size) or ReferenceState(0, 0, None)
@@ -122,7 +117,6 @@ def render_frame(
     Raises:
         InputError: a file cannot be written.
     """
-    tracer.place(number)
     if job.film is None and not job.has(number, 0, job.features):
         found = tracer.features(number)
         write_buffers(job.folder, number, {name: _image(found[name], job.size) for name in job.features})

@@ -8,7 +8,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 
-NOISE_EPSILON = 0.01
+_EPSILON = 0.01
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ReferenceHalves:
     def __init__(self, mean: Array, spp: int = 0, passes: int = 0) -> None:
         self._sums = np.stack([mean * spp, np.zeros_like(mean)])
         # Paths per pixel of each half.
-        self.paths, self.passes = (spp, 0), passes
+        self.paths, self.passes = [spp, 0], passes
 
     @property
     def spp(self) -> int:
@@ -63,9 +63,9 @@ class ReferenceHalves:
 
     def add(self, mean: Array, paths: int) -> None:
         """Add a pass, ``(N, 3)`` mean radiance of ``paths`` paths, to the half with fewer paths."""
-        half = 0 if self.paths[0] <= self.paths[1] else 1
+        half = int(self.paths[0] > self.paths[1])
         self._sums[half] += mean * paths
-        self.paths = (self.paths[0] + paths, self.paths[1]) if half == 0 else (self.paths[0], self.paths[1] + paths)
+        self.paths[half] += paths
         self.passes += 1
 
     def mean(self) -> Array:
@@ -78,6 +78,6 @@ class ReferenceHalves:
             return None
         first, second = (total / paths for total, paths in zip(self._sums, self.paths, strict=True))
         scale = np.sqrt(self.paths[0] * self.paths[1]) / self.spp
-        brightness = 2 * self.mean() + NOISE_EPSILON
+        brightness = 2 * self.mean() + _EPSILON
         # In single precision, like the value read back from a file's header.
         return float(np.float32(np.mean(scale * np.abs(first - second) / brightness)))

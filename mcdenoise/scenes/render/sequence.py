@@ -117,7 +117,6 @@ def render_sequence(
             ) from error
     load = partial(SequenceTracer, scene, variant, checked_moves, cameras, size, film, max_depth)
     tracer = load()
-    tracer.place(0)
     away = tracer.features(0)["position"] - cameras[0].to_world[:3, 3]
     scale = float(np.median(np.linalg.norm(away, axis=1)))
     folder = SequenceFolder(
@@ -167,7 +166,7 @@ def render_sequence(
             progress(min(done, total), total)
 
     advance(0)
-    missing = [number for number in range(count) if not job.is_finished(number)]
+    missing = [number for number in range(count) if left[number] or not job.has(number, 0, job.features)]
     if engine is None:
         for number in missing:
             folder.note_reference(number, render_frame(job, tracer, number, advance))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.render.film import Film, offsets, splat
-from mcdenoise.scenes.render.stage import Stage, to_previous
+from mcdenoise.scenes.render.loading import Stage, to_previous
 
 # Samples traced at once: enough to fill the vector units, small enough for a laptop's memory.
 WAVEFRONT = 2**22
@@ -91,10 +91,6 @@ class Tracer:
         self._table, self._index = self._shapes(looks)
         self._offsets = self._float_table(offsets(film.filter))
 
-    def place(self, frame: int) -> None:
-        """Put what moves to its place in a frame."""
-        self._stage.place(frame)
-
     def trace(
         self,
         frame: int,
@@ -110,7 +106,7 @@ class Tracer:
         """Samples of a frame.
 
         Args:
-            frame: number of the frame, to which what moves has been put.
+            frame: number of the frame.
             spp: samples a pixel.
             seed: another one gives independent noise.
             color: whether radiance is wanted; else it is 0.
@@ -121,6 +117,7 @@ class Tracer:
             even: let samples lie evenly in the pixel, to be weighed by :meth:`pixels`; else the filter's weight is in
                 their places.
         """
+        self._stage.place(frame)
         width, height = self.size
         now, before = (self._lens(self._cameras[number]) for number in (frame, max(frame - 1, 0)))
         shot = _Shot(now, before, self._movements(frame), spp, color, features, exact or self.exact, stratified, even)

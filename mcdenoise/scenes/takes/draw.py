@@ -12,8 +12,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array, Camera
 from mcdenoise.scenes.assets import Assets
 from mcdenoise.scenes.random.builder import rotate
-from mcdenoise.scenes.random.cameras import shoot
-from mcdenoise.scenes.random.movements import distance, movements
+from mcdenoise.scenes.random.cameras import distance, movements, shoot
 from mcdenoise.scenes.render.film import Film
 from mcdenoise.scenes.takes.furnish import Stock
 from mcdenoise.scenes.takes.places import build

@@ -12,7 +12,7 @@ import numpy as np
 from mcdenoise.data.camera_path import Array
 from mcdenoise.errors import InputError
 from mcdenoise.scenes.assets import Assets, Model, Surface, read_normal_map
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, place
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, place, shape
 from mcdenoise.scenes.random.furniture import ornament
 from mcdenoise.scenes.random.lights import bulb, light_color
 from mcdenoise.scenes.random.materials import Bsdf, bitmap, diffuse, lacquer, mirror, pane, random_metal, rough_plastic
@@ -102,16 +102,15 @@ def add_model(
         return False
     half = np.array(model.size) / 2 * scale
     box = place((0, float(half[1]), 0), scale=half.tolist())
-    parts = [Part("mesh", box, builder.material(_bsdf(rng, surface)), mesh=mesh) for mesh, surface in found]
+    parts = [shape("mesh", box, builder.material(_bsdf(rng, surface)), mesh=mesh) for mesh, surface in found]
     for lamp in model.lamps if brightness else ():
         radius = max(lamp.diameter / 2 * scale, 0.01)
         center = box[:3, :3] @ np.clip(lamp.center, -1, 1) + box[:3, 3]
         color, black = light_color(rng), builder.material(diffuse((0.02, 0.02, 0.02)))
         parts.append(bulb(center, radius, black, brightness / len(model.lamps), color))
-    builder.add(parts, frame, movable=movable)
+    builder.add(parts, frame, movable=movable, look=(0, half[1], 0))
     stock.credits.add(f"{model.name} ({model.credit})")
     stock.triangles += sum(len(mesh.faces) for mesh, _ in found)
-    builder.points.append((frame @ np.array((0, half[1], 0, 1)))[:3])
     return True
 
 
@@ -131,7 +130,7 @@ def _bsdf(rng: Rng, surface: Surface) -> Bsdf:
     if change < 0.12:
         return random_metal(rng)
     if surface.shine > 0.04 or change > 0.8:
-        alpha = math.sqrt(2 / (max(surface.exponent, 1) + 2)) * float(rng.uniform(0.4, 1))
+        alpha = math.sqrt(2 / (max(surface.exponent, 1) + 2)) * rng.uniform(0.4, 1)
         return rough_plastic(image, float(np.clip(alpha, 0.02, 0.45)))
     return diffuse(image)
 
@@ -156,10 +155,10 @@ class Floor:
         """A free place at a height: along a wall, facing inwards, or anywhere."""
         for _ in range(14):
             wall = int(rng.integers(4))
-            turn = (0.0, 90.0, 180.0, -90.0)[wall]
+            turn = TURNS[wall]
             along = rng.random() < walls
             if not along and rng.random() < 0.5:
-                turn = float(rng.uniform(0, 360))
+                turn = rng.uniform(0, 360)
             c, s = abs(math.cos(math.radians(turn))), abs(math.sin(math.radians(turn)))
             half = np.array((c * width + s * depth, s * width + c * depth)) / 2
             low, high = self.low[[0, 2]] + half + 0.02, self.high[[0, 2]] - half - 0.02
@@ -204,7 +203,7 @@ def fill_room(builder: SceneBuilder, rng: Rng, stock: Stock, brightness: float) 
         x = float(rng.uniform(-0.35, 0.35) * side)
         y = min(model.elevation, float(room[1]) - model.size[1] - 0.02)
         deep = float(room[2] if wall % 2 == 0 else room[0]) / 2 - model.size[2] / 2
-        frame = place((0, 0, 0), (0, 90, 180, -90)[wall]) @ place((x, y, -deep))
+        frame = place((0, 0, 0), TURNS[wall]) @ place((x, y, -deep))
         add_model(builder, rng, stock, model, frame, brightness=0.1 * brightness)
 
 
@@ -216,15 +215,13 @@ def fill_top(
     surface, small = Floor(-half, half), stock.small()
     for _ in range(int(rng.integers(1, most + 1))):
         model = stock.model(rng, small)
-        size = float(rng.uniform(0.06, 0.3)) * min(1.0, max(width, depth))
+        size = rng.uniform(0.06, 0.3) * min(1.0, max(width, depth))
         if model is not None and rng.random() < 0.2:
             model = None
         spot = surface.find(rng, *((size, size) if model is None else (model.size[0], model.size[2])), top, walls=0)
         if spot is None:
             continue
-        where = frame @ spot
         if model is None:
-            builder.add(ornament(builder, rng, size), where, movable=True)
-            builder.points.append(where[:3, 3])
+            builder.add(ornament(builder, rng, size), frame @ spot, movable=True, look=(0, 0, 0))
         else:
-            add_model(builder, rng, stock, model, where, movable=True)
+            add_model(builder, rng, stock, model, frame @ spot, movable=True)

@@ -9,15 +9,14 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.assets import Mesh, read_sky
-from mcdenoise.scenes.random.builder import Part, SceneBuilder, box, place, sheet
-from mcdenoise.scenes.random.lights import add_lamps, light_color, scaled, sky, softbox, studio, sun_direction
+from mcdenoise.scenes.random.builder import TURNS, SceneBuilder, box, place, shape, sheet
+from mcdenoise.scenes.random.lights import add_lamps, daylight, light_color, scaled, sky, softbox, studio, sun_direction
 from mcdenoise.scenes.random.materials import diffuse, glass, random_opaque
 from mcdenoise.scenes.random.rooms import (
     closed_wall,
     colonnade,
     empty_room,
     light_experiment,
-    outwards,
     still_life,
     wall_with_windows,
 )
@@ -79,7 +78,7 @@ def _print(rng: Rng, area: float) -> dict[str, object]:
         weight = np.zeros((side, side, 1))
         weight[::step], weight[:, ::step] = 1, 1
     ink, paper = np.array(random_color(rng)), np.array(random_color(rng))
-    repeat = max(1.0, round(math.sqrt(area) * float(rng.uniform(0.5, 3))))
+    repeat = max(1.0, round(math.sqrt(area) * rng.uniform(0.5, 3)))
     return diffuse(weight * ink + (1 - weight) * paper, (repeat, repeat))
 
 
@@ -105,25 +104,20 @@ def _room(rng: Rng, windows: list[int], glow: Color | None = None) -> tuple[Scen
     return builder, opening
 
 
-def _surface(builder: SceneBuilder) -> float:
-    width, height, depth = builder.high - builder.low
-    return float(2 * (width * height + height * depth + depth * width))
-
-
 def _day(rng: Rng, stock: Stock) -> SceneBuilder:
     """A furnished room lit through its windows."""
     windows = rng.permutation(4)[: int(rng.choice([1, 2, 3], p=[0.4, 0.4, 0.2]))].tolist()
     color = scaled(light_color(rng), 10)
     glow = color if rng.random() < _GLOWING else None
     builder, opening = _room(rng, windows, glow)
-    level = float(np.clip(0.25 * _surface(builder) / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
-    sun = sun_direction(rng, outwards(windows[0])) if rng.random() < 0.65 else None
+    level = float(np.clip(0.25 * builder.surface() / max(opening, 0.1), 1.5, 40)) * math.exp(rng.uniform(-0.7, 0.7))
+    sun = sun_direction(rng, TURNS[(windows[0] + 2) % 4]) if rng.random() < 0.65 else None
     if glow is None:
         builder.set_sky(any_sky(rng, stock, level, sun, float(np.exp(rng.uniform(-1, 1.6)))))
     lamps = rng.random() < 0.25
     if lamps:
         add_lamps(builder, rng, int(rng.integers(1, 3)), 0.1)
-    fill_room(builder, rng, stock, 0.1 * _surface(builder) if lamps else 0.0)
+    fill_room(builder, rng, stock, 0.1 * builder.surface() if lamps else 0.0)
     return builder
 
 
@@ -134,13 +128,13 @@ def _evening(rng: Rng, stock: Stock) -> SceneBuilder:
     if windows:
         builder.set_sky(any_sky(rng, stock, float(np.exp(rng.uniform(-5, -0.5))), None, 0))
     add_lamps(builder, rng, int(rng.choice([1, 2, 3], p=[0.4, 0.35, 0.25])), 0.35)
-    fill_room(builder, rng, stock, 0.5 * _surface(builder))
+    fill_room(builder, rng, stock, 0.5 * builder.surface())
     return builder
 
 
 def _desk(rng: Rng, stock: Stock) -> SceneBuilder:
     """Small things on a table before a wall, seen from near."""
-    wide, deep = float(rng.uniform(0.9, 1.8)), float(rng.uniform(0.6, 0.9))
+    wide, deep = rng.uniform(0.9, 1.8), rng.uniform(0.6, 0.9)
     builder = SceneBuilder((-wide * 0.8, 0.05, -deep / 2), (wide * 0.8, 1.1, deep * 1.6))
     top = builder.material(random_opaque(rng, (1.0, 1.0), textured=0.7))
     builder.add([box((0, -0.02, 0), (wide, 0.04, deep), top)])
@@ -151,23 +145,23 @@ def _desk(rng: Rng, stock: Stock) -> SceneBuilder:
         side = float(rng.choice([-1, 1]))
         builder.add([box((side * (wide / 2 + 0.4), 0.6, 1), (0.1, 3.0, 6), wall)])
     if rng.random() < 0.4:
-        shelf = place((0, float(rng.uniform(0.35, 0.6)), -deep / 2 + 0.1))
+        shelf = place((0, rng.uniform(0.35, 0.6), -deep / 2 + 0.1))
         builder.add([box((0, -0.01, 0), (wide, 0.02, 0.25), top)], shelf)
         fill_top(builder, rng, stock, shelf, wide, 0.25, 0.0, most=9)
     fill_top(builder, rng, stock, np.eye(4), wide, deep, 0.0, most=16)
     lights = int(rng.integers(0, 3))
     sun = sun_direction(rng, 0.0) if rng.random() < 0.5 else None
     if lights == 0 or rng.random() < 0.6:
-        builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.1, 1)), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
+        builder.set_sky(any_sky(rng, stock, rng.uniform(0.1, 1), sun, float(np.exp(rng.uniform(-0.7, 1.8)))))
     for _ in range(lights):
         origin = np.array((rng.uniform(-1, 1), rng.uniform(0.5, 1.6), rng.uniform(0, 1.4)))
-        softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), float(rng.uniform(3, 15)) / lights)
+        softbox(builder, rng, origin, rng.uniform(-0.4, 0.4, 3) * (1, 0, 1), rng.uniform(3, 15) / lights)
     return builder
 
 
 def _street(rng: Rng, stock: Stock) -> SceneBuilder:
     """Ground under a sky, with plants, vehicles, people and blocks of houses."""
-    reach = float(rng.uniform(4, 9))
+    reach = rng.uniform(4, 9)
     builder = SceneBuilder((-reach, 0.25, -reach), (reach, 2.6, reach))
     repeat = float(rng.integers(8, 40))
     ground = builder.material(random_opaque(rng, (repeat, repeat), textured=0.85))
@@ -184,35 +178,33 @@ def _street(rng: Rng, stock: Stock) -> SceneBuilder:
         frame = floor.find(rng, model.size[0], model.size[2], walls=0) if model else None
         if model and frame is not None:
             add_model(builder, rng, stock, model, frame, movable=max(model.size) < 3)
-    sun = sun_direction(rng) if rng.random() < 0.75 else None
-    builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1.8)))))
+    builder.set_sky(any_sky(rng, stock, *daylight(rng, 0.75, (0.6, 1.8), (-0.5, 1.8))))
     return builder
 
 
 def _pool(rng: Rng, stock: Stock) -> SceneBuilder:
     """A basin of water under a sky, with things around it and in it."""
-    wide, deep = float(rng.uniform(1.5, 4)), float(rng.uniform(1.5, 4))
+    wide, deep = rng.uniform(1.5, 4), rng.uniform(1.5, 4)
     builder = SceneBuilder((-wide, 0.15, -deep), (wide, 1.8, deep))
     tiles = builder.material(random_opaque(rng, (4, 4), textured=0.95))
     stone = builder.material(random_opaque(rng, (6, 6), textured=0.6))
-    depth = float(rng.uniform(0.2, 0.8))
+    depth = rng.uniform(0.2, 0.8)
     parts = [box((0, -depth - 0.05, 0), (wide + 0.4, 0.1, deep + 0.4), tiles)]
     for sign in (-1, 1):
         parts.append(box((sign * (wide / 2 + 2.0), -0.5, 0), (4, 1, deep + 8), stone))
         parts.append(box((0, -0.5, sign * (deep / 2 + 2.0)), (wide, 1, 4), stone))
     builder.add(parts)
-    level = -float(rng.uniform(0.02, 0.15))
-    surface = place((0, level, 0), scale=(wide / 2, float(rng.uniform(0.003, 0.02)), deep / 2))
+    level = -rng.uniform(0.02, 0.15)
+    surface = place((0, level, 0), scale=(wide / 2, rng.uniform(0.003, 0.02), deep / 2))
     water = builder.material(glass(1.33))
-    builder.add([Part("mesh", surface, water, mesh=_waves(rng))])
+    builder.add([shape("mesh", surface, water, mesh=_waves(rng))])
     for _ in range(4):
         builder.points.append(rng.uniform((-wide / 3, -depth, -deep / 3), (wide / 3, 0, deep / 3)))
     fill_top(builder, rng, stock, np.eye(4), 0.8 * wide, 0.8 * deep, -depth, most=5)
     for sign in (-1, 1):
         frame = place((0, 0, sign * (deep / 2 + 0.5)))
         fill_top(builder, rng, stock, frame, 1.5 * wide, 0.8, 0.0, most=6)
-    sun = sun_direction(rng) if rng.random() < 0.6 else None
-    builder.set_sky(any_sky(rng, stock, float(rng.uniform(0.6, 1.8)), sun, float(np.exp(rng.uniform(-0.5, 1)))))
+    builder.set_sky(any_sky(rng, stock, *daylight(rng, 0.6, (0.6, 1.8), (-0.5, 1))))
     return builder
 
 
@@ -242,8 +234,8 @@ def _display(rng: Rng, stock: Stock) -> SceneBuilder:
         if model is None:
             break
         spot = rng.uniform(-0.5, 0.5, 3) * (1 if number else 0)
-        frame = place(spot - (0, 0.3, 0), float(rng.uniform(0, 360)))
-        size = float(rng.uniform(0.5, 1.1))
+        frame = place(spot - (0, 0.3, 0), rng.uniform(0, 360))
+        size = rng.uniform(0.5, 1.1)
         add_model(builder, rng, stock, model, frame, scale=size / max(model.size), movable=True)
     if rng.random() < 0.3:
         base = builder.material(random_opaque(rng, textured=0.5))

@@ -10,7 +10,7 @@ import numpy as np
 
 from mcdenoise.data.camera_path import Array
 from mcdenoise.scenes.random.materials import METALS
-from mcdenoise.scenes.render.stage import Stage
+from mcdenoise.scenes.render.loading import Stage
 from mcdenoise.scenes.render.tracer import ALBEDO, COLOR, DEPTH, HIT, NORMAL, REST, Samples, Tracer
 from mcdenoise.scenes.takes.draw import Take
 
@@ -32,7 +32,7 @@ class TakeTracer(Tracer):
         half: samples a pixel of each half of a reference.
 
     Raises:
-        InputError: see :class:`mcdenoise.scenes.render.stage.Stage`.
+        InputError: see :class:`mcdenoise.scenes.render.loading.Stage`.
     """
 
     # No light of a scene is as bright by far: such a sample is an error of rounding, and one would spoil a reference.
@@ -134,13 +134,9 @@ def _looks(take: Take) -> dict[str, tuple[float, ...]]:
         if material is not None:
             while "bsdf" in material:
                 material = material["bsdf"]
+            alpha = material.get("alpha", float(material["type"] == "diffuse"))
+            mean = float(np.mean(alpha["bitmap"] if isinstance(alpha, Mapping) else alpha))
             color = {"black": (0, 0, 0), "white": (1, 1, 1), "color": METALS.get(material.get("material"), (1, 1, 1))}
-            looks[name] = (_roughness(material), *color[take.glossy])
+            # Perceptual roughness is the root of Beckmann's parameter.
+            looks[name] = (math.sqrt(min(max(mean, 0.0), 1.0)), *color[take.glossy])
     return looks
-
-
-def _roughness(bsdf: Mapping[str, Any]) -> float:
-    """Perceptual roughness, the root of Beckmann's parameter."""
-    alpha = bsdf.get("alpha", float(bsdf["type"] == "diffuse"))
-    mean = float(np.mean(alpha["bitmap"] if isinstance(alpha, Mapping) else alpha))
-    return math.sqrt(min(max(mean, 0.0), 1.0))
