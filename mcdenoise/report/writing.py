@@ -12,7 +12,7 @@ import numpy as np
 from mcdenoise.data.files import make_folder, write_text
 from mcdenoise.errors import import_optional
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
+from mcdenoise.report.gallery import REFERENCE, Gallery, kept_pictures, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, FORMATS, data_uri, decode
 from mcdenoise.report.views import Range, Row, View, front, metrics, rank, shortlist, views
 from mcdenoise.results import STAGES, Kind, Results
@@ -188,7 +188,8 @@ def _file_name(name: str, place: int) -> str:
 
 
 def _galleries(folder: Path, results: Results) -> list[Gallery]:
-    pixels, factor = picture_pixels(folder, results), 1
+    kept = ((scene, own) for scene in results.scenes for own in kept_pictures(folder, results, scene).values())
+    pixels, factor = sum(scene.width * scene.height * len(own) for scene, own in kept), 1
     while pixels > FORMATS[-1][0] * factor**2:
         factor *= 2
     return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
