@@ -10,14 +10,13 @@ but frames per second are not. The script needs `mcdenoise[ray]`.
 """
 
 import argparse
-import json
 import tempfile
 import time
 from pathlib import Path
 
 import torch
 
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import write_json
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.engines import RayEngine
 from mcdenoise.film import read_film, run_film
@@ -74,7 +73,7 @@ def main() -> None:
                 flush=True,
             )
     if options.json is not None:
-        write_text(options.json, json.dumps(rows, indent=2) + "\n")
+        write_json(options.json, rows)
 
 
 if __name__ == "__main__":

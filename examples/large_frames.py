@@ -15,12 +15,12 @@ import tempfile
 from pathlib import Path
 
 import torch
+from run_time import check_least, write_figures
 
 from mcdenoise.benchmark import parse_sizes
 from mcdenoise.benchmark.machine import describe_machine
 from mcdenoise.benchmark.memory import output_and_peak
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.models import DEFAULT
@@ -62,9 +62,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to this file too")
     options = parser.parse_args()
 
-    for name, minimum in (("threads", 1), ("frames", 2)):
-        if getattr(options, name) < minimum:
-            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
+    check_least(options, threads=1, frames=2)
     torch.set_num_threads(options.threads)
     machine = describe_machine("cpu")
     print(f"{options.model}, {options.precision}, within {options.max_memory:g} GB, {options.frames} frames")
@@ -76,8 +74,7 @@ def main() -> None:
             cost = measure(width, height, options, Path(folder))
         costs.append(cost)
         print("{size:<12}{network:>20.0f}{total:>8.0f}{peak:>10.2f}  {tiles}".format(**cost), flush=True)
-    if options.json:
-        write_text(options.json, json.dumps({"machine": vars(machine), "costs": costs}, indent=2) + "\n")
+    write_figures(options.json, costs=costs)
 
 
 if __name__ == "__main__":

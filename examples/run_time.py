@@ -11,7 +11,6 @@ core. As in the commands of the package, the process keeps freed memory (mcdenoi
 """
 
 import argparse
-import json
 import re
 import statistics
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from takes import TIMED
 
 from mcdenoise import Frame, create_model
 from mcdenoise.benchmark.machine import describe_machine
-from mcdenoise.data.files import write_text
+from mcdenoise.data.files import write_json
 from mcdenoise.errors import InputError, run_script
 from mcdenoise.heap import keep_heap
 from mcdenoise.methods import parse_method
@@ -61,6 +60,26 @@ def calls_of(spelt: str, frame: Frame, threads: int) -> dict[str, Callable[[], o
     return {f"{spelling.name}{mark}": partial(call, precision) for precision, mark in names.items()}
 
 
+def check_least(options: argparse.Namespace, **least: int) -> None:
+    """Check that options are at least so large."""
+    for name, minimum in least.items():
+        if (value := getattr(options, name)) is not None and value < minimum:
+            raise InputError(f"--{name}: expected at least {minimum}, found {value}")
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height."""
+    if not (match := re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)):
+        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{text}'")
+    return int(match[1]), int(match[2])
+
+
+def write_figures(path: Path | None, **figures: object) -> None:
+    """Write figures and the machine that they were measured on to the file of ``--json``, if it is given."""
+    if path is not None:
+        write_json(path, {"machine": vars(describe_machine("cpu")), **figures})
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--models", nargs="+", default=[*TIMED], metavar="MODEL")
@@ -71,16 +90,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, minimum in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < minimum:
-            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
-    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
-    if not match:
-        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")
+    check_least(options, threads=1, rounds=2)
+    width, height = size_of(options.size)
     torch.set_num_threads(options.threads)
     if not options.no_heap:
         keep_heap()
-    width, height = int(match[1]), int(match[2])
     torch.manual_seed(0)
     normal = torch.nn.functional.normalize(torch.randn(1, 3, height, width))
     color, albedo, depth = (torch.rand(1, channels, height, width) for channels in (3, 3, 1))
@@ -98,9 +112,7 @@ def main() -> None:
     for name, values in times.items():
         low, median, high = statistics.quantiles(values, n=4)
         print(f"{name:<44}{median:>8.0f}{f'{low:.0f} .. {high:.0f}':>16}{median / unit:>13.2f}")
-    if options.json:
-        machine = describe_machine("cpu")
-        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": times}, indent=2) + "\n")
+    write_figures(options.json, milliseconds=times)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from run_time import check_least
 from torch import Tensor
 
 from mcdenoise import Denoiser, Frame, InputError
@@ -126,8 +127,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, metavar="N")
     parser.add_argument("--markdown", action="store_true", help="print a table in Markdown")
     options = parser.parse_args()
-    if options.frames < 2:
-        raise InputError(f"--frames: expected at least 2, found {options.frames}")
+    check_least(options, frames=2)
     if options.threads:
         torch.set_num_threads(options.threads)
     whole = Denoiser(options.model, precision=options.precision, keep_all=True)

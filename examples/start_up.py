@@ -11,21 +11,20 @@ is installed, as it is with this package; in the second row it cannot, and the l
 """
 
 import argparse
-import json
-import re
-import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 
-from mcdenoise.benchmark.machine import describe_machine
+from run_time import check_least, size_of, write_figures
+
+from mcdenoise.benchmark.machine import fix_threads
 from mcdenoise.benchmark.sizes import synthetic_frame
-from mcdenoise.data.files import write_text
 from mcdenoise.data.readers.bmfr import write_bmfr_frame
 from mcdenoise.errors import InputError, run_script
+from mcdenoise.turns import interleaved
 
 PEER = """
 import sys
@@ -65,13 +64,11 @@ device.release()
 """
 
 
-def seconds(command: list[str]) -> float:
-    """Run time of a process, which must succeed."""
-    start = time.perf_counter()
+def run(command: list[str]) -> None:
+    """Run a process, which must succeed."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise InputError(f"{' '.join(command[:4])}: expected to succeed, found: {done.stderr.strip()[-300:]}")
-    return time.perf_counter() - start
 
 
 def main() -> None:
@@ -87,15 +84,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, minimum in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < minimum:
-            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
-    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", options.size)
-    if not match:
-        raise InputError(f"--size: expected WIDTHxHEIGHT such as 1280x720, found '{options.size}'")
-    folder = Path(tempfile.mkdtemp(prefix="start-up-"))
-    try:
-        write_bmfr_frame(folder / "frame", 0, synthetic_frame(int(match[1]), int(match[2])))
+    check_least(options, threads=1, rounds=2)
+    fix_threads(options.threads)
+    width, height = size_of(options.size)
+    with tempfile.TemporaryDirectory(prefix="start-up-") as place:
+        folder = Path(place)
+        write_bmfr_frame(folder / "frame", 0, synthetic_frame(width, height))
         threads = str(options.threads)
         peer = [str(folder / "frame"), str(folder / "oidn.exr"), options.quality, threads]
         own = ["denoise", str(folder / "frame"), "-o", str(folder / "out"), "--model", options.model]
@@ -111,23 +105,16 @@ def main() -> None:
             },
             "import torch": [sys.executable, "-P", "-c", "import torch"],
         }
-        times: dict[str, list[float]] = {name: [] for name in commands}
-        for _ in range(options.rounds + 1):
-            for name, command in commands.items():
-                times[name].append(seconds(command))
-    finally:
-        shutil.rmtree(folder)
+        milliseconds = interleaved({name: partial(run, command) for name, command in commands.items()}, options.rounds)
 
-    times = {name: values[1:] for name, values in times.items()}
+    times = {name: [each / 1e3 for each in later] for name, (_, *later) in milliseconds.items()}
     first = statistics.median(next(iter(times.values())))
     print(f"{options.size}, one frame, whole process, {threads} threads, {options.rounds} rounds")
     print(f"{'seconds':<46}{'median':>8}{'quartiles':>16}{'behind':>9}")
     for name, values in times.items():
         low, median, high = statistics.quantiles(values, n=4)
         print(f"{name:<46}{median:>8.2f}{f'{low:.2f} .. {high:.2f}':>16}{median - first:>+9.2f}")
-    if options.json:
-        machine = vars(describe_machine("cpu")) | {"threads": options.threads}
-        write_text(options.json, json.dumps({"machine": machine, "seconds": times}, indent=2) + "\n")
+    write_figures(options.json, seconds=times)
 
 
 if __name__ == "__main__":

@@ -11,9 +11,9 @@ Open Image Denoise has its best setting of each take: features as noisy, as exac
 
 import argparse
 import json
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from statistics import fmean, geometric_mean
 from typing import TypeAlias
 
 import torch
@@ -62,12 +62,6 @@ def errors(denoiser: Denoiser, frames: Sequence[Frame], reference: Tensor) -> di
     return {name: round(value.item(), 5) for name, value in found.items()}
 
 
-def mean(values: Iterable[float]) -> float:
-    """The geometric mean."""
-    logs = [math.log(value) for value in values]
-    return math.exp(sum(logs) / len(logs))
-
-
 def rows_of(rows: Rows, *, moving: bool) -> list[dict[str, dict[str, float]]]:
     """The rows of shots, or of stills, which have no error of change."""
     return [row for row in rows.values() if ("tsmape" in row[OIDN[0]]) == moving]
@@ -90,10 +84,10 @@ def table(rows: Rows, models: list[str], moving: bool) -> Iterable[str]:
     for name in models:
         found = ratios(rows, name, "smape", moving=moving)
         ahead = [row[name]["psnr"] - max(row[each]["psnr"] for each in OIDN) for row in kept]
-        light = sum(row[name]["light"] for row in kept) / len(kept)
-        cells = [f"{mean(found):.3f}", f"{max(found):.3f}", f"{sum(ahead) / len(ahead):+.2f} dB", f"{light:.3f}"]
+        light = fmean(row[name]["light"] for row in kept)
+        cells = [f"{geometric_mean(found):.3f}", f"{max(found):.3f}", f"{fmean(ahead):+.2f} dB", f"{light:.3f}"]
         temporal = ("tsmape", "trmse") if moving else ()
-        cells += [f"{mean(ratios(rows, name, key, moving=True)):.3f}" for key in temporal]
+        cells += [f"{geometric_mean(ratios(rows, name, key, moving=True)):.3f}" for key in temporal]
         yield " | ".join([f"| {name}", *cells]) + " |"
 
 

@@ -11,7 +11,6 @@ prints medians, quartiles and steps per second. As in the command, the process k
 
 import argparse
 import itertools
-import json
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -21,10 +20,10 @@ from typing import get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from run_time import check_least, write_figures
 
 from mcdenoise.benchmark.machine import describe_machine, fix_threads
-from mcdenoise.data.files import write_text
-from mcdenoise.errors import InputError, run_script
+from mcdenoise.errors import run_script
 from mcdenoise.heap import keep_heap
 from mcdenoise.models import DEFAULT, create_model
 from mcdenoise.models._precision import Precision
@@ -103,9 +102,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every time to this file too")
     options = parser.parse_args()
 
-    for name, minimum in (("threads", 1), ("rounds", 2)):
-        if getattr(options, name) < minimum:
-            raise InputError(f"--{name}: expected at least {minimum}, found {getattr(options, name)}")
+    check_least(options, threads=1, rounds=2)
     fix_threads(options.threads)
     keep_heap()
     runs: dict[str, Callable[[], object]] = {}
@@ -124,8 +121,7 @@ def main() -> None:
         low, median, high = statistics.quantiles(values, n=4)
         spread = f"{low:.0f} .. {high:.0f}"
         print(f"{precision:<12}{median:>10.0f}{spread:>16}{1e3 / median:>10.2f}")
-    if options.json:
-        write_text(options.json, json.dumps({"machine": vars(machine), "milliseconds": times}, indent=2) + "\n")
+    write_figures(options.json, milliseconds=times)
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ is written, and pages that differ from the figures are an error.
 import argparse
 import json
 import re
-import statistics
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from statistics import geometric_mean, median
 from typing import NamedTuple
 
-from takes import METHODS, NOISY, OIDN, TIMED, Rows, mean, ratios
+from takes import METHODS, NOISY, OIDN, TIMED, Rows, ratios
 
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError, run_script
@@ -53,13 +53,13 @@ def errors_of(takes: Rows, name: str) -> Errors:
     """The errors of a method."""
     shots, stills = (ratios(takes, name, "smape", moving=moving) for moving in (True, False))
     flicker = ratios(takes, name, "tsmape", moving=True)
-    return Errors(mean(shots), max(shots), mean(flicker), mean(stills), max(stills))
+    return Errors(geometric_mean(shots), max(shots), geometric_mean(flicker), geometric_mean(stills), max(stills))
 
 
 def milliseconds(times: dict[str, list[float]], name: str) -> dict[str, float]:
     """Medians, by precision."""
     kinds = {"float32": times.get(name), "bfloat16": times.get(f"{name}, bfloat16")}
-    return {kind: statistics.median(values) for kind, values in kinds.items() if values}
+    return {kind: median(values) for kind, values in kinds.items() if values}
 
 
 def fastest(times: dict[str, list[float]], name: str) -> list[float]:
@@ -96,13 +96,11 @@ def long_table(figures: Figures) -> str:
     def of(name: str, key: str) -> list[float]:
         return ratios(figures.long, name, key, moving=True)
 
-    rows = [
-        [
-            label,
-            *(f"{value:.2f}" for value in (mean(of(name, "smape")), max(of(name, "smape")), mean(of(name, "tsmape")))),
-        ]
-        for name, label in METHODS.items()
-    ]
+    rows = []
+    for name, label in METHODS.items():
+        smape, flicker = of(name, "smape"), of(name, "tsmape")
+        values = geometric_mean(smape), max(smape), geometric_mean(flicker)
+        rows.append([label, *(f"{value:.2f}" for value in values)])
     return lines(rows, ["", "error", "worst", "flicker"])
 
 

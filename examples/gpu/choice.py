@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from train import Tiles, by_level, rate_of
+from train import Tiles, by_level
 
 from mcdenoise.commit import source_commit
 from mcdenoise.data.files import atomic_path
@@ -29,6 +29,7 @@ from mcdenoise.models._weights import find_weights
 from mcdenoise.models.wild import _PACE, Trust
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops._constants import BLOCK
+from mcdenoise.train.config import cosine_rate
 from mcdenoise.train.front import split
 
 LOGITS = (-40.0, 0.0, 40.0)  # of none, half, and all
@@ -82,7 +83,7 @@ def learn(trust: Trust, data: tuple[Tensor, Tensor, Tensor], steps: int) -> None
     optimizer, found = torch.optim.Adam(trust.parameters(), RATE), list[float]()
     for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = RATE * rate_of(step, WARM_UP, step / steps)
+            group["lr"] = RATE * cosine_rate(step, step / steps, WARM_UP)
         which = torch.multinomial(data[2], BATCH, replacement=True)
         weights = (_PACE * trust.last(trust.layers(data[0][which]))).sigmoid().split(1, 1)
         loss = expected(data[1][which], *weights).log().mean()

@@ -40,6 +40,7 @@ from mcdenoise.nn.inputs import auto_exposure
 from mcdenoise.nn.oidn import oidn_exposure
 from mcdenoise.ops import demodulate, remodulate
 from mcdenoise.train import TrainConfig
+from mcdenoise.train.config import cosine_rate
 from mcdenoise.train.front import split
 from mcdenoise.train.loop import begun, check_finite
 from mcdenoise.train.losses import display_error
@@ -47,7 +48,6 @@ from mcdenoise.train.recipe import Recipe
 from mcdenoise.train.run_folder import RunFolder, about_weights
 
 LOOKS, LOOK = 20, 20.0  # validations, and looks for new parts; but at least that many seconds apart
-WARM_UP = 200
 RELATIVE = 0.01  # added to the error of a frame before its logarithm is taken
 BARE = 0.06  # probability that a frame has no normal, and half that of one without albedo
 YOUNG = 0.35  # probability that a frame has no history
@@ -136,11 +136,6 @@ def by_level(spp: Tensor, frames: Tensor) -> Tensor:
     """How often each of several takes is drawn: a noise level by the square root of its number of frames."""
     levels = spp.unique(return_inverse=True)[1]
     return frames / torch.zeros_like(frames).index_add_(0, levels, frames)[levels].sqrt()
-
-
-def rate_of(step: int, warm_up: int, part: float) -> float:
-    """The learning rate over that of the recipe: a linear start, and a cosine over the whole run."""
-    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
 
 
 def framed(fixed: Tensor, history: Tensor) -> tuple[Frame, Tensor]:
@@ -273,7 +268,7 @@ class Run:
         Parts of the gradient that are not finite count as 0: a clip that overflows must not end the run.
         """
         config = self.config
-        rate = rate_of(self.steps, WARM_UP, part)
+        rate = cosine_rate(self.steps, part)
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * rate * group["pace"]
         frame, reference = tiles.draw(config, clips)

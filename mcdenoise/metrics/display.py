@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Literal
 
 import torch
@@ -10,7 +9,8 @@ from kornia.color import linear_rgb_to_rgb
 from kornia.metrics import ssim
 from torch import Tensor
 
-from mcdenoise.metrics.metric import UncomputableError, check_images
+from mcdenoise.metrics.linear import mse
+from mcdenoise.metrics.metric import UncomputableError, check_images, check_window, package_of
 
 _SSIM_WINDOW = 11
 _LARGEST = 65504.0
@@ -90,7 +90,7 @@ def psnr_gamma(image: Tensor, reference: Tensor, *, gamma: float = 2.2) -> Tenso
 
 def psnr_of(image: Tensor, reference: Tensor) -> Tensor:
     """As :func:`psnr_srgb`, of images in [0, 1] that are shown as they are."""
-    return -10 * torch.log10((image - reference).square().mean((-3, -2, -1)))
+    return -10 * torch.log10(mse(image, reference))
 
 
 def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
@@ -126,10 +126,7 @@ def ssim_srgb(image: Tensor, reference: Tensor) -> Tensor:
 
 def ssim_of(image: Tensor, reference: Tensor) -> Tensor:
     """As :func:`ssim_srgb`, of images in [0, 1] that are shown as they are, with any number of channels."""
-    if min(image.shape[-2:]) < _SSIM_WINDOW:
-        raise UncomputableError(
-            f"SSIM's window: expected at least 11 x 11 pixels, found {image.shape[-2]} x {image.shape[-1]}"
-        )
+    check_window("SSIM's window", image, _SSIM_WINDOW)
     shown, expected = (x.reshape(-1, *x.shape[-3:]) for x in (image, reference))
     # Drop kornia's epsilon, so that equal images give 1: the denominator is at least K1^2 K2^2 without it.
     similarity = ssim(shown, expected, _SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid")
@@ -199,12 +196,7 @@ def flip(image: Tensor, reference: Tensor, dynamic_range: Literal["LDR", "HDR"])
     Raises:
         UncomputableError: the package ``flip-evaluator`` is not installed.
     """
-    try:
-        evaluator = importlib.import_module("flip_evaluator")
-    except ImportError as error:
-        raise UncomputableError(
-            "FLIP needs flip-evaluator, which is not installed; pip install 'mcdenoise[peers]', or skip FLIP"
-        ) from error
+    evaluator = package_of("FLIP", "flip-evaluator", "flip_evaluator")
     tests, truths = (
         x.detach().reshape(-1, *x.shape[-3:]).permute(0, 2, 3, 1).float().cpu().contiguous().numpy()
         for x in (image, reference)

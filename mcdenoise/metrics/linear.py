@@ -72,4 +72,9 @@ def rmse_linear(image: Tensor, reference: Tensor) -> Tensor:
         [2.0]
     """
     check_images(image, reference)
-    return (image - reference).square().mean((-3, -2, -1)).sqrt()
+    return mse(image, reference).sqrt()
+
+
+def mse(image: Tensor, reference: Tensor) -> Tensor:
+    """Mean squared error, ``(...)``, of images ``(..., C, H, W)`` of equal shapes."""
+    return (image - reference).square().mean((-3, -2, -1))

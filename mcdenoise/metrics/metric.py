@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -24,13 +26,34 @@ class Metric:
     higher_is_better: bool = False
     temporal: bool = False
 
+    def rank(self, value: float) -> float:
+        """A key to sort values by, the best first."""
+        return -value if self.higher_is_better else value
+
     def better(self, value: float, other: float) -> bool:
         """Whether the first value is strictly better than the other."""
-        return value > other if self.higher_is_better else value < other
+        return self.rank(value) < self.rank(other)
 
 
 class UncomputableError(InputError):
     """A metric cannot be computed for these images, or with this installation; the message gives the reason."""
+
+
+def package_of(metric: str, package: str, module: str) -> Any:
+    """Import the package of a metric; without it, an ``UncomputableError`` says how to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UncomputableError(
+            f"{metric} needs {package}, which is not installed; pip install 'mcdenoise[peers]', or skip {metric}"
+        ) from error
+
+
+def check_window(window: str, image: Tensor, side: int) -> None:
+    """Raise ``UncomputableError`` for an image that is smaller than a metric's window."""
+    height, width = image.shape[-2:]
+    if min(height, width) < side:
+        raise UncomputableError(f"{window}: expected at least {side} x {side} pixels, found {height} x {width}")
 
 
 def check_images(image: Tensor, reference: Tensor) -> None:

@@ -6,7 +6,6 @@ Numbers of different protocols are not comparable: for the same images, the SSIM
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from mcdenoise.metrics.display import flip, psnr_of, psnr_srgb, ssim_of, ssim_srgb
-from mcdenoise.metrics.linear import rmse_linear
-from mcdenoise.metrics.metric import Metric, UncomputableError, check_images
+from mcdenoise.metrics.linear import mse, rmse_linear, smape_linear
+from mcdenoise.metrics.metric import Metric, check_images, check_window, package_of
 
 ProtocolName = Literal["strict", "meng2020", "fan2021", "noisebase"]
 
@@ -103,17 +102,10 @@ def _of_shown(
     return metric
 
 
-def _mse(image: Tensor, reference: Tensor) -> Tensor:
-    return (image - reference).square().mean((-3, -2, -1))
-
-
 def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
     """SSIM by the defaults of scikit-image before 0.20 for floats: 7x7 box, sample covariance, a data range of 2."""
     x, y = (each.reshape(-1, *each.shape[-3:]) for each in (image, reference))
-    if min(x.shape[-2:]) < _BOX:
-        raise UncomputableError(
-            f"SSIM's window: expected at least {_BOX} x {_BOX} pixels, found {x.shape[-2]} x {x.shape[-1]}"
-        )
+    check_window("SSIM's window", x, _BOX)
     mean = partial(avg_pool2d, kernel_size=_BOX, stride=1)
     sample, c1, c2 = _BOX**2 / (_BOX**2 - 1), (0.01 * 2) ** 2, (0.03 * 2) ** 2
     xx, yy, xy = (sample * (mean(a * b) - mean(a) * mean(b)) for a, b in ((x, x), (y, y), (x, y)))
@@ -123,8 +115,7 @@ def _ssim_default(image: Tensor, reference: Tensor) -> Tensor:
 
 
 def _smape_percent(image: Tensor, reference: Tensor) -> Tensor:
-    ratio = 2 * (image - reference).abs() / (image.abs() + reference.abs() + 1e-7)
-    return 100 * ratio.mean((-3, -2, -1))
+    return 200 * smape_linear(image, reference, epsilon=1e-7)
 
 
 def _relmse(image: Tensor, reference: Tensor) -> Tensor:
@@ -139,18 +130,10 @@ def _luminance_noisebase(image: Tensor) -> Tensor:
 
 
 def _ms_ssim(image: Tensor, reference: Tensor) -> Tensor:
-    if min(image.shape[-2:]) <= 160:
-        raise UncomputableError(
-            f"MS-SSIM's five scales: expected more than 160 x 160 pixels, found {image.shape[-2]} x {image.shape[-1]}"
-        )
-    try:
-        ms_ssim = importlib.import_module("pytorch_msssim").ms_ssim
-    except ImportError as error:
-        raise UncomputableError(
-            "MS-SSIM needs pytorch-msssim, which is not installed; pip install 'mcdenoise[peers]', or skip it"
-        ) from error
+    check_window("MS-SSIM's five scales", image, 161)
+    package = package_of("MS-SSIM", "pytorch-msssim", "pytorch_msssim")
     flat = (each.reshape(-1, *each.shape[-3:]) for each in (image, reference))
-    values: Tensor = ms_ssim(*flat, data_range=1.0, size_average=False)
+    values: Tensor = package.ms_ssim(*flat, data_range=1.0, size_average=False)
     return values.reshape(image.shape[:-3])
 
 
@@ -199,7 +182,7 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
             "SSIM": Metric(_of_shown(_luminance_noisebase, ssim_of), higher_is_better=True),
             "MS-SSIM": Metric(_of_shown(_luminance_noisebase, _ms_ssim), higher_is_better=True),
             "FLIP": Metric(_noisebase(partial(flip, dynamic_range="LDR"))),
-            "MSE": Metric(_noisebase(_mse)),
+            "MSE": Metric(_noisebase(mse)),
             "tPSNR": Metric(_noisebase(_temporal_psnr), higher_is_better=True, temporal=True),
             "tRMAE": Metric(_noisebase(_temporal_rmae), temporal=True),
         },

@@ -110,14 +110,6 @@ def read_gallery(folder: Path, results: Results, scene: Scene, *, factor: int = 
     )
 
 
-def picture_pixels(folder: Path, results: Results) -> int:
-    """How many pixels all kept pictures have together."""
-    return sum(
-        scene.width * scene.height * sum(len(own) for own in kept_pictures(folder, results, scene).values())
-        for scene in results.scenes
-    )
-
-
 def kept_pictures(folder: Path, results: Results, scene: Scene) -> dict[str, dict[int, Path]]:
     """The files of the pictures that a benchmark in a folder kept, by method and frame, the reference last."""
     failed = {cell.method for cell in results.cells if cell.scene == scene.name and cell.failure}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import NamedTuple, TypeVar
@@ -104,8 +104,7 @@ def shortlist(results: Results, most: int) -> Results:
     if len(results.methods) <= most:
         return results
     view, metric = views(results)[0], next(iter(metrics(results)), "")
-    sign = -1 if metric and METRICS[metric].higher_is_better else 1
-    ranked = sorted(view.rows, key=lambda row: sign * row.errors[metric].value if metric in row.errors else math.inf)
+    ranked = sorted(view.rows, key=lambda row: rank(row, metric))
     best = {row.method.model: row for row in reversed(ranked)}
     baselines = [row for row in view.rows if row.method.kind == "baseline"]
     wanted = [*baselines, *(row for row in ranked if row in best.values()), *front(view, metric)]
@@ -145,33 +144,20 @@ def points(view: View, metric: str) -> list[tuple[Row, Range, Range]]:
 
 
 def front(view: View, metric: str) -> list[Row]:
-    """The methods on the Pareto front of run time and error, by rising run time."""
-    shown = points(view, metric)
-    values = [(time.value, error.value) for _, time, error in shown]
-    higher = metric in METRICS and METRICS[metric].higher_is_better
-    return [shown[index][0] for index in pareto_front(values, higher_is_better=higher)]
+    """The methods that no other beats in run time without being beaten in error, by rising run time.
 
-
-def pareto_front(values: Sequence[tuple[float, float]], *, higher_is_better: bool = False) -> list[int]:
-    """Those that no other beats in one value without being beaten in the other.
-
-    Args:
-        values: cost, lower is better, and error.
-        higher_is_better: whether the second value is a similarity.
-
-    Returns:
-        Indices, by rising cost; of several with the same values, the first.
-
-    Example:
-        >>> pareto_front([(1.0, 5.0), (2.0, 6.0), (3.0, 2.0), (3.0, 3.0)])
-        [0, 2]
+    Of several with the same values it is the first.
     """
-    sign = -1 if higher_is_better else 1
-    front: list[int] = []
-    for index in sorted(range(len(values)), key=lambda index: (values[index][0], sign * values[index][1])):
-        if not front or sign * values[index][1] < sign * values[front[-1]][1]:
-            front.append(index)
-    return front
+    found: list[Row] = []
+    for row, *_ in sorted(points(view, metric), key=lambda point: (point[1].value, rank(point[0], metric))):
+        if not found or rank(row, metric) < rank(found[-1], metric):
+            found.append(row)
+    return found
+
+
+def rank(row: Row, metric: str) -> float:
+    """A key to sort rows by, the best first, and last those without a value."""
+    return METRICS[metric].rank(row.errors[metric].value) if metric in row.errors else math.inf
 
 
 def _row(results: Results, number: int, method: Method, scene: str) -> Row:

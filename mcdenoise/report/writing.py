@@ -12,9 +12,9 @@ import numpy as np
 from mcdenoise.data.files import make_folder, write_text
 from mcdenoise.errors import import_optional
 from mcdenoise.evaluate import METRICS
-from mcdenoise.report.gallery import REFERENCE, Gallery, picture_pixels, read_gallery
+from mcdenoise.report.gallery import REFERENCE, Gallery, kept_pictures, read_gallery
 from mcdenoise.report.pictures import BRIGHTEST, FORMATS, data_uri, decode
-from mcdenoise.report.views import Range, Row, View, front, metrics, shortlist, views
+from mcdenoise.report.views import Range, Row, View, front, metrics, rank, shortlist, views
 from mcdenoise.results import STAGES, Kind, Results
 
 FILE = "index.html"
@@ -52,7 +52,7 @@ def write_report(folder: Path) -> Path:
     galleries = _galleries(folder, results)
     shown = views(results)
     # Open Image Denoise at its best, or else the best filter, and the best network.
-    rival, ours = (_best(shown[0], names, kind) for kind in ("fixed", "trainable"))
+    rival, ours = (_best(shown[0], next(iter(names), ""), kind) for kind in ("fixed", "trainable"))
     first = [(rival or shown[0].rows[0]).method.name, ours.method.name if ours else REFERENCE]
     content = {
         "results": results,
@@ -188,7 +188,8 @@ def _file_name(name: str, place: int) -> str:
 
 
 def _galleries(folder: Path, results: Results) -> list[Gallery]:
-    pixels, factor = picture_pixels(folder, results), 1
+    kept = ((scene, own) for scene in results.scenes for own in kept_pictures(folder, results, scene).values())
+    pixels, factor = sum(scene.width * scene.height * len(own) for scene, own in kept), 1
     while pixels > FORMATS[-1][0] * factor**2:
         factor *= 2
     return [read_gallery(folder, results, scene, factor=factor) for scene in results.scenes]
@@ -228,12 +229,11 @@ def _comparer(galleries: list[Gallery], first: list[str]) -> dict[str, Any]:
     }
 
 
-def _best(view: View, names: list[str], kind: Kind) -> Row | None:
-    """The best method of a kind in the first metric; of those that are not trained, Open Image Denoise at its best."""
-    rows = [row for row in view.rows if row.method.kind == kind and names and names[0] in row.errors]
+def _best(view: View, metric: str, kind: Kind) -> Row | None:
+    """The best method of a kind in a metric; of those that are not trained, Open Image Denoise at its best."""
+    rows = [row for row in view.rows if row.method.kind == kind and metric in row.errors]
     rows = [row for row in rows if row.method.model == "oidn"] or rows
-    sign = -1 if names and METRICS[names[0]].higher_is_better else 1
-    return min(rows, key=lambda row: sign * row.errors[names[0]].value, default=None)
+    return min(rows, key=lambda row: rank(row, metric), default=None)
 
 
 def _verdict(rival: Row, ours: Row, metric: str) -> str:
@@ -261,12 +261,12 @@ def _metric(name: str) -> dict[str, Any]:
 
 def _column(shown: list[View], name: str) -> dict[str, Any]:
     """How a metric's column is printed, and the best value in it for each view."""
-    higher = METRICS[name].higher_is_better
+    metric = METRICS[name]
     values = [[row.errors[name].value for row in view.rows if name in row.errors] for view in shown]
     finite = [abs(value) for own in values for value in own if math.isfinite(value) and value != 0]
     decimals = min(max(2 - math.floor(math.log10(min(finite))), 2), 4) if finite else 2
-    best = [(max if higher else min)(own, default=None) for own in values]
-    return {"name": name, "higher": higher, "decimals": decimals, "best": best}
+    best = [min(own, key=metric.rank, default=None) for own in values]
+    return {"name": name, "higher": metric.higher_is_better, "decimals": decimals, "best": best}
 
 
 def _number(value: Range | float | None, decimals: int | None = None) -> str:

@@ -104,10 +104,12 @@ class TrainConfig:
 
     def rate(self, step: int) -> float:
         """The learning rate of a step relative to the highest one."""
-        if self.schedule == "constant":
-            return 1.0
-        warm_up = min(1.0, (step + 1) / _WARM_UP)
-        return warm_up * 0.5 * (1 + math.cos(math.pi * min(1.0, step / self.steps)))
+        return 1.0 if self.schedule == "constant" else cosine_rate(step, step / self.steps)
+
+
+def cosine_rate(step: int, part: float, warm_up: int = _WARM_UP) -> float:
+    """A linear start of some steps, and a cosine down to 0 over the whole run, of which a part is over."""
+    return min(1.0, (step + 1) / warm_up) * 0.5 * (1 + math.cos(math.pi * min(1.0, part)))
 
 
 def told(error: msgspec.ValidationError, kinds: Mapping[str, Any]) -> str:

@@ -2,14 +2,20 @@ from pathlib import Path
 
 import pytest
 
-from mcdenoise.report.views import Range, pareto_front, shortlist, views
+from mcdenoise.report.views import Range, Row, View, front, shortlist, views
 from mcdenoise.results import Cell, Method, Results, Spread
 
 
-def test_front_of_known_points():
+@pytest.mark.parametrize(("metric", "sign"), [("SMAPE", 1), ("PSNR", -1)])
+def test_front_of_known_points(metric: str, sign: int):
     #         dominated by 1    front       front       dominated    tie in cost, worse   costly and worst
     values = [(2.0, 9.0), (1.0, 8.0), (4.0, 3.0), (5.0, 3.0), (4.0, 4.0), (9.0, 8.5)]
-    assert pareto_front(values) == [1, 2]
+    method = Method("one", "fixed", "one", "one")
+    rows = [
+        Row(method, number, {metric: Range(sign * error, 0, 0)}, Range(time, 0, 0))
+        for number, (time, error) in enumerate(values)
+    ]
+    assert [row.number for row in front(View("", rows), metric)] == [1, 2]
 
 
 def test_mean_over_scenes(folder: Path):
