@@ -6,10 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.nn.unet import Live
+from mcdenoise.ops._backend import is_transformed
 
 # Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
@@ -148,3 +150,12 @@ def prepared(model: Model, frame: Frame) -> Frame:
     """
     statistics = getattr(model, "statistics", None)
     return frame if statistics is None else frame.replace(statistics={**frame.statistics, **statistics(frame)})
+
+
+def at_hand(device: torch.device) -> bool:
+    """Whether a step may read values on its device, to skip work: a graph that is recorded, or ``vmap``, has none.
+
+    On a CPU, reading a value costs little compared with what it saves. On any other device the host would wait for all
+    queued work, so a step reads nothing there and computes everything, as a recorded graph does.
+    """
+    return device.type == "cpu" and not torch.compiler.is_compiling() and not is_transformed()

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.light import Repairs
-from mcdenoise.models._interface import Note
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Note, at_hand
 from mcdenoise.models._stopwatch import Moment, Stopwatch
 
 # Handles numbers once they have been read from the device.

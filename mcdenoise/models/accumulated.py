@@ -14,9 +14,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, with_light
 from mcdenoise.models._history import NO_MOTION, comparable, motion_unless_still, reset_of, surface_before
-from mcdenoise.models._interface import GUIDES, Model, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Note, Output, State, at_hand
 from mcdenoise.models._layers import alpha_of, completed
-from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface
