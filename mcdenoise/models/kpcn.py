@@ -100,7 +100,6 @@ class KpcnNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         if frame.diffuse is None or frame.specular is None or self.specular is None:
             reason = "these weights are for color alone" if self.specular is None else "no diffuse and specular light"
             image = self.diffuse.filtered(frame.color, frame)

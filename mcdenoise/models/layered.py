@@ -83,7 +83,6 @@ class LayeredNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
         embedded, context = self.embedding(samples_input(frame, light))
         logits = of_each(self.partition, with_context(embedded, context)).to(light.dtype)

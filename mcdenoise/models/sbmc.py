@@ -78,7 +78,6 @@ class SbmcNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
         known = with_context(*self.embedding(samples_input(frame, light)))
         mean, total = light[:, 0], None
