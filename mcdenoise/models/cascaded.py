@@ -24,10 +24,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.tiled import Tiled

@@ -31,10 +31,10 @@ from __future__ import annotations
 import torch
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import Network, check_odd, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.nn.samples import (
     CHANNELS,
     PLANNED,
