@@ -122,7 +122,7 @@ class Model(Protocol):
 
     A method with a state may declare how fast it forgets with an attribute ``persistence``: the largest fraction of the
     kept history that remains after one more frame, in [0, 1), or ``None`` if it is unknown. See
-    :func:`mcdenoise.models._remembered.frames_remembered`.
+    :func:`mcdenoise.models._wrapper.frames_remembered`.
     """
 
     @property

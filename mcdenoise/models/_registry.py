@@ -18,9 +18,9 @@ from typing import Any, Literal
 from torch import nn
 
 from mcdenoise.errors import InputError, check_choice, did_you_mean, in_one_line
-from mcdenoise.models._adapter import as_model
 from mcdenoise.models._defaults import outlined, plain_defaults, without_draws
 from mcdenoise.models._interface import Model, Needs
+from mcdenoise.models._wrapper import as_model
 from mcdenoise.own import load_own, refused
 
 GROUP = "mcdenoise.models"
