@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mcdenoise.light import Repairs
 from mcdenoise.models._interface import Note, at_hand
-from mcdenoise.models._stopwatch import Moment, Stopwatch
+from mcdenoise.models._times import Moment, Stopwatch
 
 # Handles numbers once they have been read from the device.
 Tell: TypeAlias = Callable[[Sequence[float]], None]
