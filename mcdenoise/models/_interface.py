@@ -15,8 +15,10 @@ from mcdenoise.ops._backend import is_transformed
 
 # Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
-# Takes values that a device computes, and what handles their numbers, in memory order, as soon as they are known.
-Ask: TypeAlias = Callable[[Tensor, Callable[[Sequence[float]], None]], None]
+# Handles numbers, in memory order, once they have been read from the device; may raise.
+Tell: TypeAlias = Callable[[Sequence[float]], None]
+# Takes values that a device computes, and what handles their numbers as soon as they are known.
+Ask: TypeAlias = Callable[[Tensor, Tell], None]
 
 
 class Note(NamedTuple):
