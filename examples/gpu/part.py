@@ -15,7 +15,7 @@ from torch import Tensor
 from mcdenoise import Frame
 from mcdenoise.benchmark.machine import check_device
 from mcdenoise.data.files import write_json
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
 
 # Width and height of whole frames.
 SIZES = ((1280, 720), (1920, 1080))

@@ -19,7 +19,7 @@ from mcdenoise.check.cases import OPS, Case, Inputs, Op, map_tensors
 from mcdenoise.check.overview import relative_error
 from mcdenoise.data.files import new_folder
 from mcdenoise.errors import InputError, in_one_line
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
 from mcdenoise.ops import use
 from mcdenoise.ops._backend import Backend
 from mcdenoise.ops._op import backends_of

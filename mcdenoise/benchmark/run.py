@@ -28,7 +28,7 @@ from mcdenoise.errors import InputError, MissingBufferError, in_one_line, naming
 from mcdenoise.evaluate import METRICS, USUAL, Scores, check_references, reference_noise
 from mcdenoise.frame import Frame
 from mcdenoise.models._report import Stage, summarize
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
 from mcdenoise.results import IMAGES, STAGES, Cell, Method, Results, Scene, Spread
 
 _WHOLE, _COMPUTING = "whole", "computing"

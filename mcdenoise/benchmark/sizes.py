@@ -13,7 +13,7 @@ from mcdenoise.benchmark.memory import Peaks
 from mcdenoise.benchmark.methods import Timed
 from mcdenoise.errors import InputError, in_one_line
 from mcdenoise.frame import Frame
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
 from mcdenoise.results import Cost, Fit, Method, Spread
 
 Size = tuple[int, int]

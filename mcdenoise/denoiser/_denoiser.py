@@ -21,18 +21,17 @@ from mcdenoise.denoiser._watch import REPEATED, Watch
 from mcdenoise.errors import InputError, check_choice, level_of_caller
 from mcdenoise.frame import MOTION, Frame, Hints, tells_motion
 from mcdenoise.models import DEFAULT, Model, Output, State, create_model
-from mcdenoise.models._adapter import as_model
 from mcdenoise.models._contract import absent_buffers, checked_step, owned
+from mcdenoise.models._interface import at_hand
 from mcdenoise.models._layers import REST, alpha_of, completed, opened
 from mcdenoise.models._memory import Division, Frames
 from mcdenoise.models._precision import Chosen, Precision, computing_in, fastest_precision, has_network
-from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._times import Times, stages_of
 from mcdenoise.models._void import with_void
 from mcdenoise.models._weights import model_of
 from mcdenoise.models._wrapped import seam, unwrapped, wrapped
-from mcdenoise.models._wrapper import name_of, parts_of
+from mcdenoise.models._wrapper import as_model, name_of, parts_of
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.noise import noise_of
 

@@ -11,8 +11,8 @@ from torch import nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
 from mcdenoise.models import Model, Note
+from mcdenoise.models._interface import at_hand
 from mcdenoise.models._layers import closed
-from mcdenoise.models._reads import at_hand
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._void import Void, without_void
 

@@ -37,9 +37,9 @@ from mcdenoise.errors import InputError
 from mcdenoise.film.manifest import PICTURES, RECORDS, Shot
 from mcdenoise.folder import FrameError, prepare_folder, write_frames, write_report
 from mcdenoise.heap import keep_heap, return_heap
-from mcdenoise.models._remembered import frames_remembered
 from mcdenoise.models._report import FrameReport
 from mcdenoise.models._weights import find_weights
+from mcdenoise.models._wrapper import frames_remembered
 from mcdenoise.preview import Preview
 from mcdenoise.reading import read_bytes
 from mcdenoise.sequence_report import SequenceReport

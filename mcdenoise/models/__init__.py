@@ -1,9 +1,8 @@
 """The zoo: denoisers assembled from the operators, by name, and wrappers that any method can use."""
 
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
-from mcdenoise.models._registry import list_models
+from mcdenoise.models._registry import list_models, register_model
 from mcdenoise.models._weights import create_model, describe_weights, load_weights, save_weights, start_with
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.accumulated import Accumulated

@@ -13,8 +13,7 @@ from torch.utils import _pytree as pytree
 from mcdenoise.buffers import BUFFERS, MATRIX
 from mcdenoise.errors import InputError, MissingBufferError, in_one_line
 from mcdenoise.frame import Frame
-from mcdenoise.models._interface import Ask, Model, Needs, Output, State
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Ask, Model, Needs, Output, State, at_hand
 from mcdenoise.models._registry import needs_of_models
 from mcdenoise.models._weights import pretrained_models
 

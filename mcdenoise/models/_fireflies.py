@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import at_hand
 from mcdenoise.ops import clamp_fireflies
 from mcdenoise.ops._window import block_means
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame, tells_motion
-from mcdenoise.models._interface import Note, State
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Note, State, at_hand
 from mcdenoise.models._state import own_state
 from mcdenoise.ops import Surface, motion_from_position, reproject, resample
 

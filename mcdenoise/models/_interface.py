@@ -6,15 +6,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.nn.unet import Live
+from mcdenoise.ops._backend import is_transformed
 
 # Any pytree of tensors ``(B, ...)``. ``None`` stands for a missing part, such as the state before the first frame.
 State: TypeAlias = Any
-# Takes values that a device computes, and what handles their numbers, in memory order, as soon as they are known.
-Ask: TypeAlias = Callable[[Tensor, Callable[[Sequence[float]], None]], None]
+# Handles numbers, in memory order, once they have been read from the device; may raise.
+Tell: TypeAlias = Callable[[Sequence[float]], None]
+# Takes values that a device computes, and what handles their numbers as soon as they are known.
+Ask: TypeAlias = Callable[[Tensor, Tell], None]
 
 
 class Note(NamedTuple):
@@ -120,7 +124,7 @@ class Model(Protocol):
 
     A method with a state may declare how fast it forgets with an attribute ``persistence``: the largest fraction of the
     kept history that remains after one more frame, in [0, 1), or ``None`` if it is unknown. See
-    :func:`mcdenoise.models._remembered.frames_remembered`.
+    :func:`mcdenoise.models._wrapper.frames_remembered`.
     """
 
     @property
@@ -148,3 +152,12 @@ def prepared(model: Model, frame: Frame) -> Frame:
     """
     statistics = getattr(model, "statistics", None)
     return frame if statistics is None else frame.replace(statistics={**frame.statistics, **statistics(frame)})
+
+
+def at_hand(device: torch.device) -> bool:
+    """Whether a step may read values on its device, to skip work: a graph that is recorded, or ``vmap``, has none.
+
+    On a CPU, reading a value costs little compared with what it saves. On any other device the host would wait for all
+    queued work, so a step reads nothing there and computes everything, as a recorded graph does.
+    """
+    return device.type == "cpu" and not torch.compiler.is_compiling() and not is_transformed()

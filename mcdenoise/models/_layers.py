@@ -138,8 +138,7 @@ def fractions(frame: Frame, image: Tensor) -> Mapping[str, Tensor]:
     Returns:
         ``(B, 3, H, W)`` for each layer: weighted means of its pixels.
     """
-    frame = frame.replace(statistics={**frame.statistics, **image_statistics(frame)})
-    logarithm = torch.log1p(image.clamp_min(0) * frame.statistics["exposure"])
+    logarithm = torch.log1p(image.clamp_min(0) * image_statistics(frame)["exposure"])
     features = zip((*unit_features_of(frame), logarithm), _FALLOFFS, strict=True)
     guide = torch.cat([feature.to(logarithm.dtype) * falloff**0.5 for feature, falloff in features], 1)
     fine = torch.cat(list(frame.layers.values()), 1)

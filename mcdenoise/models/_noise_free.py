@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._fireflies import light_of
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import at_hand
 from mcdenoise.ops import NO_ALBEDO
 from mcdenoise.ops._window import of_blocks, up_to_multiple
 

@@ -12,9 +12,8 @@ from torch import nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import Kind
 from mcdenoise.models._interface import Model
-from mcdenoise.models._registry import build_model, find_model, list_models, needs_of_models
+from mcdenoise.models._registry import Kind, build_model, find_model, list_models, needs_of_models
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.own import refused
 

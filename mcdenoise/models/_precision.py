@@ -13,7 +13,7 @@ import torch.nn.functional as F
 
 from mcdenoise.errors import check_choice
 from mcdenoise.models._interface import Model
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
 from mcdenoise.models._wrapper import Wrapper, parts_of
 from mcdenoise.nn._cpu import has_fused_convolution
 from mcdenoise.nn.oidn import OidnUNet

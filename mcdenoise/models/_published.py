@@ -51,31 +51,32 @@ def as_published(method: Model, alpha_min: float = ALPHA) -> Model:
     )
 
 
-def behind(wrap: Callable[[Model], Model], method: Callable[..., Model]) -> Callable[..., Model]:
-    """A constructor of a method inside a wrapper, with the settings of the method."""
+def behind(wrap: Callable[..., Model], method: Callable[..., Model]) -> Callable[..., Model]:
+    """A constructor of a method inside wrappers: its settings are the method's and, by keyword, those of the wrappers.
+
+    Args:
+        wrap: puts wrappers around a method; its keyword-only arguments are settings.
+        method: a constructor, whose settings determine the weights.
+    """
+    own = inspect.signature(method)
+    added = [each for each in inspect.signature(wrap).parameters.values() if each.kind is each.KEYWORD_ONLY]
 
     @functools.wraps(method, updated=())
-    def made(*settings: Any, **named: Any) -> Model:
-        return wrap(method(*settings, **named))
+    def made(*sizes: Any, **named: Any) -> Model:
+        around = {each.name: named.pop(each.name) for each in added if each.name in named}
+        return wrap(method(*sizes, **named), **around)
 
+    made.__signature__ = own.replace(parameters=[*own.parameters.values(), *added])  # type: ignore[attr-defined]
     return made
 
 
 def published(network: Callable[..., Model]) -> Callable[..., Model]:
-    """A constructor of a network, or of a chain of tiled ones, behind exposure and :func:`as_published`.
+    """A constructor of a network, or of a chain of tiled ones, behind exposure and :func:`as_published`."""
 
-    A model's settings are then those of the network, which determine its weights, and by keyword ``alpha_min``.
-    """
-
-    @functools.wraps(network, updated=())
-    def made(*sizes: Any, alpha_min: float = ALPHA, **named: Any) -> Model:
-        inner = network(*sizes, **named)
+    def wrap(inner: Model, *, alpha_min: float = ALPHA) -> Model:
         return as_published(Exposed(inner if isinstance(inner, Chain) else Tiled(inner)), alpha_min)
 
-    own = inspect.signature(network)
-    added = inspect.Parameter("alpha_min", inspect.Parameter.KEYWORD_ONLY, default=ALPHA, annotation="float")
-    made.__signature__ = own.replace(parameters=[*own.parameters.values(), added])  # type: ignore[attr-defined]
-    return made
+    return behind(wrap, network)
 
 
 def check_odd(kernel_size: int) -> None:
@@ -91,13 +92,9 @@ class Network(nn.Module):
         """Exposure and depth scale of the whole image."""
         return image_statistics(frame)
 
-    def features(self, frame: Frame) -> list[Tensor]:
-        """Albedo, normal and depth, normalised to the range from 0 to 1 (Sec. 4.2 of the paper)."""
-        return unit_features_of(frame.replace(statistics=frame.statistics or self.statistics(frame)))
-
     def input_of(self, frame: Frame, image: Tensor) -> Tensor:
-        """The image, albedo, ``normal / 2 + 1 / 2`` and depth, ``(B, 10, H, W)``."""
-        return torch.cat([image, *self.features(frame)], 1)
+        """The image, albedo, ``normal / 2 + 1 / 2`` and depth in [0, 1] (Sec. 4.2 of the paper), ``(B, 10, H, W)``."""
+        return torch.cat([image, *unit_features_of(frame)], 1)
 
 
 def displayed(frame: Frame) -> Tensor:

@@ -1,4 +1,4 @@
-"""Finding and making models by name: those of the register, of installed packages, and a user's own."""
+"""The register of models, and making them by name: those of the zoo, of installed packages, and a user's own."""
 
 from __future__ import annotations
 
@@ -7,23 +7,92 @@ import importlib
 import inspect
 import pkgutil
 import re
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from importlib.metadata import Distribution, EntryPoint, distributions
 from types import BuiltinFunctionType
-from typing import Any
+from typing import Any, Literal
 
 from torch import nn
 
-from mcdenoise.errors import InputError, did_you_mean, in_one_line
-from mcdenoise.models._adapter import as_model
+from mcdenoise.errors import InputError, check_choice, did_you_mean, in_one_line
 from mcdenoise.models._defaults import outlined, plain_defaults, without_draws
-from mcdenoise.models._entries import MODELS, Entry
 from mcdenoise.models._interface import Model, Needs
+from mcdenoise.models._wrapper import as_model
 from mcdenoise.own import load_own, refused
 
 GROUP = "mcdenoise.models"
 _FACTORY = "expected a factory, a function without required arguments that returns a model"
+
+# How a model makes its image, in listing order: predicted kernels; predicted pixels; bilateral grids; a recurrent
+# network; a filter without weights; another denoiser; or unspecified.
+Kind = Literal["kernel", "pixel", "grid", "recurrent", "filter", "peer", "other"]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered model.
+
+    Args:
+        construct: makes the model, with fresh weights.
+        settings: arguments for ``construct`` under this name.
+        description: one line.
+        kind: how the model makes its image.
+        paper: authors and year; empty if there is none.
+    """
+
+    construct: Callable[..., Any]
+    settings: dict[str, Any]
+    description: str
+    kind: Kind = "other"
+    paper: str = ""
+
+    @property
+    def of_zoo(self) -> bool:
+        """Whether it is a model of this package."""
+        return str(getattr(self.construct, "__module__", "")).startswith("mcdenoise.models.")
+
+    @property
+    def architecture(self) -> dict[str, Any]:
+        """The settings that determine the weights, with their defaults: the constructor's positional arguments."""
+        parameters = inspect.signature(self.construct).parameters.values()
+        own = {each.name: each.default for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD}
+        return own | {name: value for name, value in self.settings.items() if name in own}
+
+
+MODELS: dict[str, Entry] = {}
+
+
+def register_model(
+    name: str, description: str = "", *, kind: Kind = "other", paper: str = "", **settings: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator that registers a model's constructor under ``name``.
+
+    The constructor's positional arguments determine the weights (sizes); its keyword-only arguments do not (history,
+    skipping).
+
+    Args:
+        name: the registered name.
+        description: one line; by default the first line of the constructor's docstring.
+        kind: how the model makes its image.
+        paper: authors and year, such as "Schied et al. 2017".
+        settings: arguments for the constructor under this name.
+
+    Raises:
+        ValueError: the name is taken, or the kind is unknown.
+    """
+    check_choice("kind", kind, Kind)
+
+    def enter(constructor: Callable[..., Any]) -> Callable[..., Any]:
+        if name in MODELS:
+            raise ValueError(f"model '{name}' is registered twice")
+        about = description or (constructor.__doc__ or "").strip().partition("\n")[0]
+        MODELS[name] = Entry(constructor, settings, about, kind, paper)
+        return constructor
+
+    return enter
 
 
 def list_models(pattern: str = "*") -> list[str]:

@@ -7,20 +7,16 @@ when the report is read or when the next frame begins.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from mcdenoise.light import Repairs
-from mcdenoise.models._interface import Note
-from mcdenoise.models._reads import at_hand
-from mcdenoise.models._stopwatch import Moment, Stopwatch
-
-# Handles numbers once they have been read from the device.
-Tell: TypeAlias = Callable[[Sequence[float]], None]
+from mcdenoise.models._interface import Note, Tell, at_hand
+from mcdenoise.models._times import Moment, Stopwatch
 
 
 @dataclass(frozen=True)

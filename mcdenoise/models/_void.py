@@ -18,8 +18,7 @@ from torch import Tensor
 
 from mcdenoise.frame import Frame
 from mcdenoise.models._alpha import noise_of_alpha, without_noise
-from mcdenoise.models._interface import Output
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Output, at_hand
 from mcdenoise.models.exposed import scaled
 
 # Where more than this fraction of the light is in pixels of alpha 0 (a glow), alpha does not say where light can be.

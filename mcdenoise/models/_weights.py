@@ -18,9 +18,8 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError, first_line, naming
 from mcdenoise.models._defaults import without_draws
-from mcdenoise.models._entries import Entry
 from mcdenoise.models._interface import Model
-from mcdenoise.models._registry import build_model, find_model, list_models, outline_model
+from mcdenoise.models._registry import Entry, build_model, find_model, list_models, outline_model
 from mcdenoise.reading import check_file
 
 _SHIPPED = Path(__file__).parent / "weights"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -14,9 +14,8 @@ from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, RADIANCE, Frame, tells_motion
 from mcdenoise.models._fireflies import believed, light_of, light_of_fireflies, with_light
 from mcdenoise.models._history import NO_MOTION, comparable, motion_unless_still, reset_of, surface_before
-from mcdenoise.models._interface import GUIDES, Model, Note, Output, State
+from mcdenoise.models._interface import GUIDES, Model, Note, Output, State, at_hand
 from mcdenoise.models._layers import alpha_of, completed
-from mcdenoise.models._reads import at_hand
 from mcdenoise.models._state import ADVICE, own_pair, own_state
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import Surface
@@ -340,13 +339,10 @@ class Accumulated(Wrapper):
         """The frame with the layers, the alpha and the buffers of its history."""
         if not carried:
             return frame
-        alpha = alpha_of(frame)
-        names = (*frame.layers, *(() if alpha is None else ("alpha",)), *self.also)
-        found = [(name, part) for name, part in zip(names, carried, strict=True) if part is not None]
-        layers = {name: part[:, COLOR] for name, part in found[: len(frame.layers)]}
-        rest = found[len(frame.layers) :]
-        alpha = frame.alpha if alpha is None else rest.pop(0)[1][:, :1]
-        also = {name: part[:, COLOR] for name, part in rest}
+        parts: Iterator[Any] = iter(carried)
+        layers = {name: next(parts)[:, COLOR] for name in frame.layers}
+        alpha = frame.alpha if alpha_of(frame) is None else next(parts)[:, :1]
+        also = {name: part[:, COLOR] for name, part in zip(self.also, parts, strict=True) if part is not None}
         own = {name: also.pop(name) for name in RADIANCE if name in also}
         return frame.replace(layers=layers, alpha=alpha, extra={**frame.extra, **also}, **own)
 

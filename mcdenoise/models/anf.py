@@ -38,13 +38,13 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, behind
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
-from mcdenoise.nn.inputs import features_of, normalized_depth
+from mcdenoise.nn.inputs import features_of, image_statistics, normalized_depth
 from mcdenoise.nn.samples import describe_samples, samples_of
 from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import affinity_filter
@@ -117,7 +117,7 @@ class Anf(Network):
 
     def embedded(self, frame: Frame) -> Tensor:
         """The mean embedding of the samples of each pixel, ``(B, width, H, W)``."""
-        statistics = frame.statistics or self.statistics(frame)
+        statistics = image_statistics(frame)
         near, typical = statistics["depth_scale"].split(1, 1)
         albedo, normal, depth = features_of(frame)
         dtype = accumulator_dtype(frame.color.dtype)

@@ -41,9 +41,9 @@ import torch
 from torch import Tensor
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, surface_before
 from mcdenoise.models._published import behind
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.svgf import BRIGHTEST, WINDOW, Svgf, variance_of
 from mcdenoise.ops import luminance_moments, moments_variance, reproject, temporal_gradient

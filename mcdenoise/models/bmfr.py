@@ -38,11 +38,11 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import ALPHA, as_published
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.antialiased import Antialiased
 from mcdenoise.ops import block_regression

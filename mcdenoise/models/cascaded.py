@@ -24,14 +24,15 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Model, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.fusion import FusionModule
+from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.nn.unet import UNet
 from mcdenoise.ops import cross_bilateral_filter, downsample
 
@@ -99,7 +100,7 @@ class KernelNetwork(_Scales):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        x, (albedo, normal, depth) = frame.color, self.features(frame)
+        x, (albedo, normal, depth) = frame.color, unit_features_of(frame)
         levels = self.unet(torch.cat([x, albedo, normal, depth], 1))
         # Negative weights have no meaning as proportions.
         x = with_carried(frame) if self.normalize == "softmax" else x

@@ -8,11 +8,10 @@ from typing import Any
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._adapter import as_model
 from mcdenoise.models._interface import Model, Needs, Note, Output, State, prepared
 from mcdenoise.models._layers import completed
 from mcdenoise.models._state import own_parts
-from mcdenoise.models._wrapper import Wrapper
+from mcdenoise.models._wrapper import Wrapper, as_model
 from mcdenoise.models.exposed import Exposed
 
 

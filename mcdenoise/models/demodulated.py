@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame, scale_samples
-from mcdenoise.models._interface import Note, Output, State
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Note, Output, State, at_hand
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops import NO_ALBEDO, demodulate, remodulate
 from mcdenoise.ops._rows import by_rows

@@ -18,8 +18,7 @@ from torch import Tensor, nn
 from mcdenoise.errors import check_choice
 from mcdenoise.frame import Frame
 from mcdenoise.models._defaults import outlined
-from mcdenoise.models._interface import Model, Needs, Note, Output, State
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Model, Needs, Note, Output, State, at_hand
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.models.tiled import Tiled
 from mcdenoise.nn.oidn import FeatureFilter

@@ -12,10 +12,10 @@ from __future__ import annotations
 from torch import nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, check_odd, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.mrkp import Backbone, with_glorot
 from mcdenoise.ops import cross_bilateral_filter
 

@@ -42,10 +42,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, check_odd, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.svgf import BRIGHTEST
 from mcdenoise.nn.inputs import unit_features_of
 from mcdenoise.nn.unet import Live
@@ -100,7 +100,6 @@ class KpcnNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         if frame.diffuse is None or frame.specular is None or self.specular is None:
             reason = "these weights are for color alone" if self.specular is None else "no diffuse and specular light"
             image = self.diffuse.filtered(frame.color, frame)

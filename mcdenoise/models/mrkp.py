@@ -24,10 +24,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, check_odd, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.ops import downsample, kernel_conv
 from mcdenoise.ops._window import accumulator_dtype, corner, parts_of, up_to_multiple
 

@@ -48,10 +48,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError, check_choice
 from mcdenoise.frame import MOTION, Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.tiled import MIRRORED, with_border, without_border
 from mcdenoise.nn.inputs import features_of, normalize_depth
 from mcdenoise.nn.samples import describe_samples, samples_of

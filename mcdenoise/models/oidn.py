@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError, check_choice, import_optional
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.demodulated import Demodulated

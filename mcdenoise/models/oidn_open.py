@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError, check_choice
 from mcdenoise.frame import Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State, prepared
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._tza import Archive, archives_in, read_tza
 from mcdenoise.models.oidn import Filters, Oidn, Quality, library_of_oidn
 from mcdenoise.models.tiled import Tiled

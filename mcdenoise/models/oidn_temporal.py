@@ -15,9 +15,9 @@ from typing import Literal
 from torch import Tensor
 
 from mcdenoise.errors import check_choice
-from mcdenoise.models._adapter import FromBuffers
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model
+from mcdenoise.models._registry import register_model
+from mcdenoise.models._wrapper import FromBuffers
 from mcdenoise.models.chain import Chain
 from mcdenoise.models.oidn import Quality
 from mcdenoise.models.recurrent import Recurrent

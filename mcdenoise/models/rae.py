@@ -40,10 +40,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import MOTION, Frame, tells_motion
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, reprojected
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._published import behind
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.accumulated import CUT_FRACTION
 from mcdenoise.models.demodulated import Demodulated

@@ -30,10 +30,10 @@ from typing import Any
 import torch
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Note, Output, State
 from mcdenoise.models._layers import answered, carried
 from mcdenoise.models._published import Network, check_odd, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.nn.samples import (
     CHANNELS,
     PLANNED,
@@ -78,7 +78,6 @@ class SbmcNetwork(Network):
 
     def forward(self, frame: Frame, state: State = None) -> tuple[Output, State]:
         """See :class:`mcdenoise.models.Model`."""
-        frame = frame.replace(statistics=frame.statistics or self.statistics(frame))
         light, others = samples_of(frame), carried(frame)
         known = with_context(*self.embedding(samples_input(frame, light)))
         mean, total = light[:, 0], None

@@ -17,11 +17,11 @@ from torch import Tensor, nn
 from mcdenoise.errors import InputError
 from mcdenoise.frame import MOTION, Frame
 from mcdenoise.models._contract import check_needs
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._history import Past, motion_unless_still, reset_of, surface_before
 from mcdenoise.models._interface import Needs, Note, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import behind
+from mcdenoise.models._registry import register_model
 from mcdenoise.models._state import own_state
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.ops import accumulate, atrous, luminance_moments, moments_variance

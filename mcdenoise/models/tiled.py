@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from mcdenoise.frame import BUFFERS, Frame
-from mcdenoise.models._interface import Model, Note, Output, State, prepared
-from mcdenoise.models._reads import at_hand
+from mcdenoise.models._interface import Model, Note, Output, State, at_hand, prepared
 from mcdenoise.models._wrapper import Wrapper
 from mcdenoise.ops._window import mirrored
 

@@ -19,9 +19,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import Model, Needs, Output, State
 from mcdenoise.models._layers import answered
+from mcdenoise.models._registry import register_model
 from mcdenoise.models.accumulated import Accumulated
 from mcdenoise.models.demodulated import Demodulated
 from mcdenoise.models.filtered import Features, Filtered

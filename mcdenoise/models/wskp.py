@@ -28,10 +28,10 @@ from torch import Tensor, nn
 
 from mcdenoise.errors import InputError
 from mcdenoise.frame import Frame
-from mcdenoise.models._entries import register_model
 from mcdenoise.models._interface import GUIDES, Needs, Output, State
 from mcdenoise.models._layers import answered, with_carried
 from mcdenoise.models._published import Network, displayed, published
+from mcdenoise.models._registry import register_model
 from mcdenoise.ops import importance_filter
 
 SIDES = (3, 5, 7, 9, 11, 13)

@@ -106,6 +106,6 @@ def image_statistics(frame: Frame) -> dict[str, Tensor]:
 
 
 def unit_features_of(frame: Frame) -> list[Tensor]:
-    """Albedo, normal and depth in [0, 1] for a frame with the statistics of :func:`image_statistics`."""
+    """Albedo, normal and depth in [0, 1], with the scale of :func:`image_statistics`."""
     albedo, normal, depth = features_of(frame)
-    return [albedo, normal * 0.5 + 0.5, normalized_depth(depth, *frame.statistics["depth_scale"].split(1, 1))]
+    return [albedo, normal * 0.5 + 0.5, normalized_depth(depth, *image_statistics(frame)["depth_scale"].split(1, 1))]

@@ -61,6 +61,8 @@ class OidnUNet(nn.Module):
         ValueError: there is no such size.
     """
 
+    multiple = _MULTIPLE  # side of a pixel of the coarsest level
+
     def __init__(self, in_channels: int = 9, size: Size = "base", out_channels: int = _COLORS) -> None:
         super().__init__()
         if size not in _SIZES:
@@ -79,11 +81,6 @@ class OidnUNet(nn.Module):
     def convolutions(self) -> list[nn.Conv2d]:
         """All convolutions, in the order of the library's archives."""
         return [layer for layer in self.modules() if isinstance(layer, nn.Conv2d)]
-
-    @property
-    def multiple(self) -> int:
-        """Side of a pixel of the coarsest level."""
-        return _MULTIPLE
 
     @property
     def reach(self) -> int:

@@ -62,7 +62,7 @@ def samples_input(frame: Frame, samples: Tensor) -> Tensor:
     """The network input for each sample.
 
     Args:
-        frame: with the statistics of :func:`mcdenoise.nn.inputs.image_statistics`.
+        frame: with the features of each pixel.
         samples: ``(B, S, 3, H, W)``, see :func:`samples_of`.
 
     Returns:

@@ -16,7 +16,7 @@ from mcdenoise.film.manifest import Shot
 from mcdenoise.film.work import Found, look, make
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model, list_models
-from mcdenoise.models._remembered import frames_remembered
+from mcdenoise.models._wrapper import frames_remembered
 from mcdenoise.shot import ShotSettings
 
 SHOT = Shot("s", (), ShotSettings())

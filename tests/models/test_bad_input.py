@@ -24,9 +24,9 @@ from mcdenoise.models import (
     register_model,
     save_weights,
 )
-from mcdenoise.models._adapter import as_model
 from mcdenoise.models._registry import find_model
 from mcdenoise.models._weights import pretrained_models
+from mcdenoise.models._wrapper import as_model
 from mcdenoise.models.accumulated import History
 from mcdenoise.models.recurrent import Recurrent
 

@@ -24,9 +24,9 @@ from toys import Same, one_of_each, small, whole_frame
 
 from mcdenoise import Denoiser, Frame, InputError, create_model, ops
 from mcdenoise.models import Accumulated, Demodulated, _report, _times, list_models
-from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._report import FrameReport
-from mcdenoise.models._stopwatch import Stopwatch
+from mcdenoise.models._times import Stopwatch
+from mcdenoise.models._wrapper import FromBuffers
 
 # Open Image Denoise is a library for processors here: images go there and back, which waits.
 ON_THE_HOST = {"oidn", "oidn_temporal"}

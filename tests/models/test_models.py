@@ -33,10 +33,9 @@ from mcdenoise.models import (
     register_model,
     save_weights,
 )
-from mcdenoise.models._adapter import as_model
 from mcdenoise.models._registry import find_model
 from mcdenoise.models._weights import compared_models, pretrained_models
-from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models._wrapper import as_model, parts_of
 from mcdenoise.nn.oidn import oidn_exposure
 
 SHIPPED = Path(__file__).parents[2] / "mcdenoise" / "models" / "weights"

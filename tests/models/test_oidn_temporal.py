@@ -16,8 +16,8 @@ from mcdenoise import Denoiser, Frame
 from mcdenoise.data import open_sequence
 from mcdenoise.metrics import smape_linear
 from mcdenoise.models import create_model
-from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._precision import Chosen, Precision, has_network
+from mcdenoise.models._wrapper import FromBuffers
 from mcdenoise.models.noisy import Noisy
 from mcdenoise.models.oidn import Oidn
 from mcdenoise.models.oidn_temporal import mixed

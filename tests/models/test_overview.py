@@ -10,8 +10,8 @@ from torch import nn
 
 from mcdenoise.cli.models import models
 from mcdenoise.models import Needs, create_model, list_models, register_model
-from mcdenoise.models._entries import Kind
 from mcdenoise.models._overview import overview
+from mcdenoise.models._registry import Kind
 from mcdenoise.models._weights import compared_models, pretrained_models
 from mcdenoise.models.oidn_open import archive_of_library
 

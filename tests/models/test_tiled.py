@@ -14,10 +14,9 @@ from toys import Blur, Mean, Same, cascade, frame_of, small
 from mcdenoise import Denoiser, Frame, create_model
 from mcdenoise.frame import Skip
 from mcdenoise.models import Needs, Output, Tiled
-from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._interface import prepared
 from mcdenoise.models._memory import Division, Frames
-from mcdenoise.models._wrapper import parts_of
+from mcdenoise.models._wrapper import FromBuffers, parts_of
 from mcdenoise.models.tiled import Region, regions
 from mcdenoise.nn.unet import Live
 from mcdenoise.ops._window import mirrored

@@ -24,8 +24,8 @@ from mcdenoise.models import (
     Tiled,
     Wrapper,
 )
-from mcdenoise.models._adapter import FromBuffers
 from mcdenoise.models._interface import prepared
+from mcdenoise.models._wrapper import FromBuffers
 from mcdenoise.models.recurrent import Recurrent
 from mcdenoise.nn import auto_exposure
 from mcdenoise.ops import demodulate, remodulate

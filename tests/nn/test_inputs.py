@@ -5,7 +5,7 @@ import torch
 
 from mcdenoise.frame import Frame
 from mcdenoise.nn import auto_exposure, normalize_depth
-from mcdenoise.nn.inputs import image_statistics, unit_features_of
+from mcdenoise.nn.inputs import unit_features_of
 
 
 def test_auto_exposure_brings_a_constant_image_to_the_key() -> None:
@@ -25,7 +25,7 @@ def test_normalized_depth_written_out() -> None:
 
 def test_a_buffer_that_is_not_there_is_constant() -> None:
     frame = Frame(torch.rand(1, 3, 5, 6))
-    given = unit_features_of(frame.replace(statistics=image_statistics(frame)))
+    given = unit_features_of(frame)
     assert [each.unique().tolist() for each in given] == [[1], [0.5], [0.5]]
 
 

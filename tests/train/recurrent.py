@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from mcdenoise.frame import Frame
 from mcdenoise.models import Accumulated, Demodulated, Model, Needs, Output
-from mcdenoise.models._adapter import FromBuffers
+from mcdenoise.models._wrapper import FromBuffers
 from mcdenoise.ops import reproject
 
 

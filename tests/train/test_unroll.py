@@ -14,7 +14,7 @@ from torch.autograd import gradcheck
 from mcdenoise import Denoiser, create_model
 from mcdenoise.data import open_sequence
 from mcdenoise.models import Output, describe_weights
-from mcdenoise.models._adapter import FromBuffers
+from mcdenoise.models._wrapper import FromBuffers
 from mcdenoise.train.clips import Clip
 from mcdenoise.train.unroll import Unrolled, unroll
 
