@@ -83,8 +83,7 @@ class Split:
         # Invalid pixels of the color are repaired later; the parts only need to be finite there.
         found = {name: np.clip(np.nan_to_num(each), 0, LARGEST_RADIANCE) for name, each in sums.items()}
         if self.specular_albedo is not None:
-            albedo = np.nan_to_num(images[self.specular_albedo][..., :3], posinf=1, neginf=0)
-            found[SPECULAR_ALBEDO] = np.clip(albedo, 0, 1)
+            found[SPECULAR_ALBEDO] = np.clip(np.nan_to_num(images[self.specular_albedo][..., :3]), 0, 1)
         return found
 
 

@@ -268,7 +268,7 @@ class RenderedFiles(FrameSequence):
             images["mask"] = np.minimum(images.get("mask", inside), inside)
         seen = ~nothing_hit(images["depth"]) if "depth" in images else None
         if "albedo" in images:
-            images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
+            images["albedo"] = np.clip(np.nan_to_num(images["albedo"]), 0, 1)
             if not self.color_has_albedo:
                 images["color"] = images["color"] * images["albedo"]
         if "normal" in images:
@@ -351,8 +351,6 @@ class RenderedFiles(FrameSequence):
             return np.repeat(pixels, 3, -1)
         if name in ("color", "motion"):
             return pixels
-        if name == "variance" and pixels.shape[2] < 3:
-            return np.repeat(pixels[..., :1], 3, -1)
         pixels = pixels[..., : BUFFERS[name].channels]
         if name == "depth" and self.negative_depths:
             return -pixels

@@ -54,7 +54,7 @@ _ORDER = {
     for spelling in row.split()
 }
 # Buffers of three channels that may have one, and names of it.
-GREY = frozenset({"color", "reference", "albedo"})
+GREY = frozenset({"color", "reference", "albedo", "variance"})
 _LUMINANCE = {"y", "l", "luminance", "grey", "gray"}
 _EYES = {"left", "right"}
 _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
@@ -278,8 +278,6 @@ def fits(buffer: str, layer: Layer) -> bool:
         return count <= 2 or layer.is_color
     if buffer == "motion":
         return count in (2, 3, 4)
-    if buffer == "variance":
-        return count in (1, 3, 4)
     return count in (3, 4) or (count == 1 and buffer in GREY)
 
 
