@@ -295,9 +295,7 @@ class RenderedFiles(FrameSequence):
             images.pop("position", None)
         if seen is not None:
             images["depth"] = np.where(seen, images["depth"], np.inf)
-        buffers = as_tensors(images)
-        if matrix is not None and not self.drops_positions:
-            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        buffers = as_tensors(images, None if self.drops_positions else matrix)
         # They are the ratio of light and alpha, which only both together can keep.
         hints = Hints(alpha=self.part_of(self.choice.layers["color"]).straight)
         return Frame(**buffers, layers={name: as_tensor(light) for name, light in lights.items()}, hints=hints)
@@ -415,9 +413,10 @@ def far_points(matrix: Array, depth: float, sky: Mask) -> Array:
     return result
 
 
-def as_tensors(images: dict[str, Image]) -> dict[str, Any]:
-    """The buffers of a frame, taken out of a dictionary one after the other: a large frame is not held twice."""
-    return {name: as_tensor(images.pop(name)) for name in [*images] if name in BUFFERS}
+def as_tensors(images: dict[str, Image], matrix: Array | None) -> dict[str, Any]:
+    """Buffers and camera of a frame; images are taken out one after the other: a large frame is not held twice."""
+    camera = {} if matrix is None else {"view_projection": torch.from_numpy(matrix).float()[None]}
+    return camera | {name: as_tensor(images.pop(name)) for name in [*images] if name in BUFFERS}
 
 
 def as_tensor(image: Image) -> Tensor:
