@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array
+from mcdenoise.data.camera_matrices import MATRICES
 from mcdenoise.data.images import Image, Mask
 from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.diffuse_specular import SPECULAR_ALBEDO, Split
@@ -18,7 +18,7 @@ from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import is_same
 from mcdenoise.data.readers.samples import SampleLayers, mean_is
 from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
-from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Convention, motion_to, read_as, read_motion
+from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Array, Convention, motion_to, read_as, read_motion
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import use
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
+from mcdenoise.data.camera_matrices import MATRICES, CameraMatrices
 from mcdenoise.data.images import EXR_SUFFIXES, Image, Mask, Metadata, Part, Window, read_image_header
 from mcdenoise.data.radiance import light_of
 from mcdenoise.data.readers.cameras import fit_camera
@@ -29,7 +29,7 @@ from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, Hints, scale_samples
-from mcdenoise.motion import USUAL_MOTION, Convention, convert
+from mcdenoise.motion import USUAL_MOTION, Array, Convention, convert
 
 # Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
