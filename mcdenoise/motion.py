@@ -355,19 +355,15 @@ def doubt_motion(frame: Frame, seen: Seen, before: Seen | None) -> str:
     now = seen.features
     if {name: each.shape for name, each in now.items()} != {name: each.shape for name, each in before.features.items()}:
         return ""
-    for name in ("motion", "previous_position", "position"):
-        if frame.buffer(name) is None or (name != "motion" and before.camera is None):
-            continue
-        if name == "position" and frame.previous_position is not None:
-            continue
-        stored = _pixels(frame, name)
-        if name == "motion":
-            stored = on_grid(stored)
-        else:
-            assert before.camera is not None
-            stored = motion_to(before.camera, stored, _hit(frame)).astype(np.float32)
-        if reason := _contradiction((now, before.features, stored)):
-            source = "'motion'" if name == "motion" else f"'{name}' with the previous 'view_projection'"
+    motions: dict[str, Image] = {}
+    if frame.motion is not None:
+        motions["'motion'"] = on_grid(_pixels(frame, "motion"))
+    points = "position" if frame.previous_position is None else "previous_position"
+    if before.camera is not None and frame.buffer(points) is not None:
+        motion = motion_to(before.camera, _pixels(frame, points), _hit(frame)).astype(np.float32)
+        motions[f"'{points}' with the previous 'view_projection'"] = motion
+    for source, motion in motions.items():
+        if reason := _contradiction((now, before.features, motion)):
             meaning = "previous = current + motion in pixels, x right, y down"
             return f"{source}: wrong, which is worse than no motion: {reason}; expected {meaning}"
     return ""

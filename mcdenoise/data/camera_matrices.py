@@ -6,16 +6,14 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.files import write_text
 from mcdenoise.errors import InputError
 from mcdenoise.reading import expecting, read_text
-
-Array: TypeAlias = NDArray[np.float64]
 
 MATRICES = "camera_matrices.h"
 _LARGEST_FILE = 50 * 2**20

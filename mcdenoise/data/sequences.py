@@ -74,10 +74,8 @@ def open_sequence(
     else:
         if by_buffer:
             own = ((name, _groups([each], where)[0]) for name, each in zip(by_buffer, given, strict=True))
-            groups, layout = (
-                with_stills([replace(group, label=name) for name, found in own for group in found]),
-                "files",
-            )
+            groups = with_stills([replace(group, label=name) for name, found in own for group in found])
+            layout = "files"
         else:
             groups, layout = _groups(given if bmfr is None else [bmfr[0]], where)
         named = parse_mapping(mapping)

@@ -121,10 +121,7 @@ class _BmfrFolder(RenderedFiles):
                 # Both must be zero: mirrors and glass have no albedo, but they have a normal.
                 nothing |= ((images["albedo"] == 0) & (images["normal"] == 0)).all(-1, keepdims=True)
             images["depth"] = np.where(nothing, np.float32(np.inf), images["depth"])
-        buffers = as_tensors(images)
-        if matrix is not None:
-            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
-        return Frame(**buffers)
+        return Frame(**as_tensors(images, matrix))
 
     def known(self, images: Mapping[str, Image]) -> Mask:
         """``(H, W)`` true where something was hit: where positions, and normals if there are any, are not zero."""

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.images import Image, Mask
-from mcdenoise.motion import NEAR, misses, sampled
+from mcdenoise.motion import NEAR, Array, misses, sampled
 
 # Number of times that outliers are rejected.
 _ROUNDS = 10

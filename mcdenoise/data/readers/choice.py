@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mcdenoise.data.camera_matrices import Array
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.images import Image
 from mcdenoise.data.readers.cameras import fit_camera
 from mcdenoise.data.readers.layers import NAMES, Layer, fits, is_about_a_buffer, is_luminance, named, recognise, usual

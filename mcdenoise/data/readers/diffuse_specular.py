@@ -11,14 +11,13 @@ the surfaces, and optionally ``emission``, which must be free of noise, and ``sp
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mcdenoise.data.images import Image
-from mcdenoise.data.readers.layers import Layer
+from mcdenoise.data.readers.layers import Layer, words_of
 from mcdenoise.data.readers.lights import KNOWN, PASSES, Light, difference, find_parts, is_same, light_of
 from mcdenoise.light import LARGEST_RADIANCE
 
@@ -27,7 +26,6 @@ DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO = "diffuse", "specular", "emission"
 LIGHT_PARTS = frozenset({DIFFUSE, SPECULAR, EMISSION, SPECULAR_ALBEDO, "samples"})
 # Every so manyth column is looked at to find out which layers are parts.
 _STEP = 8
-_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,7 @@ class Split:
         # Invalid pixels of the color are repaired later; the parts only need to be finite there.
         found = {name: np.clip(np.nan_to_num(each), 0, LARGEST_RADIANCE) for name, each in sums.items()}
         if self.specular_albedo is not None:
-            albedo = np.nan_to_num(images[self.specular_albedo][..., :3], posinf=1, neginf=0)
-            found[SPECULAR_ALBEDO] = np.clip(albedo, 0, 1)
+            found[SPECULAR_ALBEDO] = np.clip(np.nan_to_num(images[self.specular_albedo][..., :3]), 0, 1)
         return found
 
 
@@ -129,5 +126,5 @@ def find_splits(layers: Sequence[Layer], color: Layer, mapped: Mapping[str, Laye
 def _says(layer: Layer, name: str) -> bool:
     """Whether a layer's name ends with a buffer's name: ``diffuse``, ``shot_diffuse``, ``shotDiffuse``."""
     wanted = name.split("_")
-    words = [word.lower() for word in _WORD.findall(layer.title)]
+    words = [word for word in words_of(layer.title) if not word.isdigit()]
     return layer.title not in KNOWN - {EMISSION} and words[-len(wanted) :] == wanted

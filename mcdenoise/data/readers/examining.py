@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array
+from mcdenoise.data.camera_matrices import MATRICES
 from mcdenoise.data.images import Image, Mask
 from mcdenoise.data.readers.cameras import FittedCamera, fault, fit_camera
 from mcdenoise.data.readers.diffuse_specular import SPECULAR_ALBEDO, Split
@@ -18,7 +18,7 @@ from mcdenoise.data.readers.layers import Layer
 from mcdenoise.data.readers.lights import is_same
 from mcdenoise.data.readers.samples import SampleLayers, mean_is
 from mcdenoise.data.readers.values import Row, normal_is_encoded, nothing_hit, read_radiance
-from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Convention, motion_to, read_as, read_motion
+from mcdenoise.motion import MOTION_PAIRS, USUAL_MOTION, Array, Convention, motion_to, read_as, read_motion
 from mcdenoise.noise import noise_is_spread
 from mcdenoise.ops import use
 
@@ -111,21 +111,17 @@ def _examine_color(shot: RenderedFiles, images: Mapping[str, Image], words: list
 
 def _examine_positions(shot: RenderedFiles, images: dict[str, Image], readings: dict[str, list[str]]) -> None:
     position, known = images["position"], shot.known(images)
-    words = readings.setdefault("view_projection", [])
     if shot.cameras is not None:
         stated = shot.cameras.view_projection(shot.examined, shot.size)
-        if _examine_cameras(shot, stated, position, known, words):
-            return
-    if not shot.fits_cameras:
-        if not words:
-            readings.pop("view_projection")
+        said = _examine_cameras(shot, stated, position, known)
+        if shot.has_camera or not shot.fits_cameras:
+            readings["view_projection"] = [said]
+    if shot.has_camera or not shot.fits_cameras:
         return
     shot.cameras = None
     found = fit_camera(position, known)
     if found is None:
-        words.append("the positions do not tell a camera")
         readings["position"].append("not used without a camera")
-        readings.pop("view_projection")
         shot.drops_positions = True
         if len(shot.numbers) > 1:
             shot.warnings.append(
@@ -142,26 +138,24 @@ def _examine_positions(shot: RenderedFiles, images: dict[str, Image], readings: 
         # The previous positions of points are unknown.
         shot.drops_positions, shot.has_camera = True, "depth" not in images
         readings["position"].append("in the space of the camera: only its depth is used")
-        readings.pop("view_projection")
     else:
         shot.has_camera = True
-        words.append(f"found from the positions, which it sees {found.error:.2g} pixels from their own")
+        said = f"found from the positions, which it sees {found.error:.2g} pixels from their own"
+        readings["view_projection"] = [said]
 
 
-def _examine_cameras(shot: RenderedFiles, stated: Array, position: Image, known: Mask, words: list[str]) -> bool:
-    """Determine how given matrices are stored; false if they do not see the positions at their pixels."""
+def _examine_cameras(shot: RenderedFiles, stated: Array, position: Image, known: Mask) -> str:
+    """Determine how given matrices are stored, in words; unless they see the positions there is no camera."""
     shot.camera_convention, error = read_as(stated, position, known)
     shot.has_camera = shot.camera_convention != "unknown"
-    if shot.has_camera or not shot.fits_cameras:
-        how = shot.camera_convention or "row vectors, y down"
-        words.append(f"{how}: positions are seen {error:.2g} pixels from their own")
+    how = shot.camera_convention or "row vectors, y down"
     if not shot.has_camera:
         seen = f"does not see the positions at their pixels (they miss by {error:.0f}) whichever way it is read"
         instead = "cameras are found from the positions instead" if shot.fits_cameras else "no history is found"
         shot.warnings.append(f"{MATRICES}, frame {shot.examined}: {fault(stated) or seen}; {instead}")
     elif shot.camera_convention:
         shot.warnings.append(f"{MATRICES}: read as {how}, since only so it sees the positions at their pixels")
-    return shot.has_camera
+    return f"{how}: positions are seen {error:.2g} pixels from their own"
 
 
 def _is_origin(camera: FittedCamera, position: Image, known: Mask) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mcdenoise.data.camera_matrices import MATRICES, Array, CameraMatrices
+from mcdenoise.data.camera_matrices import MATRICES, CameraMatrices
 from mcdenoise.data.images import EXR_SUFFIXES, Image, Mask, Metadata, Part, Window, read_image_header
 from mcdenoise.data.radiance import light_of
 from mcdenoise.data.readers.cameras import fit_camera
@@ -29,7 +29,7 @@ from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import nothing_hit
 from mcdenoise.errors import InputError
 from mcdenoise.frame import BUFFERS, Frame, Hints, scale_samples
-from mcdenoise.motion import USUAL_MOTION, Convention, convert
+from mcdenoise.motion import USUAL_MOTION, Array, Convention, convert
 
 # Buffers of light and reflectance, which a PNG stores with a transfer function; it stores normals without.
 _LIGHT = {"color", "albedo", "reference", "diffuse", "specular", "specular_albedo", "emission"}
@@ -268,7 +268,7 @@ class RenderedFiles(FrameSequence):
             images["mask"] = np.minimum(images.get("mask", inside), inside)
         seen = ~nothing_hit(images["depth"]) if "depth" in images else None
         if "albedo" in images:
-            images["albedo"] = np.clip(np.nan_to_num(images["albedo"], nan=0, posinf=1, neginf=0), 0, 1)
+            images["albedo"] = np.clip(np.nan_to_num(images["albedo"]), 0, 1)
             if not self.color_has_albedo:
                 images["color"] = images["color"] * images["albedo"]
         if "normal" in images:
@@ -295,9 +295,7 @@ class RenderedFiles(FrameSequence):
             images.pop("position", None)
         if seen is not None:
             images["depth"] = np.where(seen, images["depth"], np.inf)
-        buffers = as_tensors(images)
-        if matrix is not None and not self.drops_positions:
-            buffers["view_projection"] = torch.from_numpy(matrix).float()[None]
+        buffers = as_tensors(images, None if self.drops_positions else matrix)
         # They are the ratio of light and alpha, which only both together can keep.
         hints = Hints(alpha=self.part_of(self.choice.layers["color"]).straight)
         return Frame(**buffers, layers={name: as_tensor(light) for name, light in lights.items()}, hints=hints)
@@ -351,8 +349,6 @@ class RenderedFiles(FrameSequence):
             return np.repeat(pixels, 3, -1)
         if name in ("color", "motion"):
             return pixels
-        if name == "variance" and pixels.shape[2] < 3:
-            return np.repeat(pixels[..., :1], 3, -1)
         pixels = pixels[..., : BUFFERS[name].channels]
         if name == "depth" and self.negative_depths:
             return -pixels
@@ -417,9 +413,10 @@ def far_points(matrix: Array, depth: float, sky: Mask) -> Array:
     return result
 
 
-def as_tensors(images: dict[str, Image]) -> dict[str, Any]:
-    """The buffers of a frame, taken out of a dictionary one after the other: a large frame is not held twice."""
-    return {name: as_tensor(images.pop(name)) for name in [*images] if name in BUFFERS}
+def as_tensors(images: dict[str, Image], matrix: Array | None) -> dict[str, Any]:
+    """Buffers and camera of a frame; images are taken out one after the other: a large frame is not held twice."""
+    camera = {} if matrix is None else {"view_projection": torch.from_numpy(matrix).float()[None]}
+    return camera | {name: as_tensor(images.pop(name)) for name in [*images] if name in BUFFERS}
 
 
 def as_tensor(image: Image) -> Tensor:

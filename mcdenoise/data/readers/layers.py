@@ -54,7 +54,7 @@ _ORDER = {
     for spelling in row.split()
 }
 # Buffers of three channels that may have one, and names of it.
-GREY = frozenset({"color", "reference", "albedo"})
+GREY = frozenset({"color", "reference", "albedo", "variance"})
 _LUMINANCE = {"y", "l", "luminance", "grey", "gray"}
 _EYES = {"left", "right"}
 _COLORS = ({"r", "g", "b"}, {"red", "green", "blue"})
@@ -230,7 +230,7 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
         whole = recognise(replace(layer, name=last[:-1]))
         if whole is not None and whole[0] != "alpha":
             return whole[0], whole[1] + _HALF_RANK
-    words = _words(last)
+    words = words_of(last)
     starts = [(words[start:], words[:start]) for start in range(len(words))]
     # A file name may also begin with the buffer.
     ends: list[tuple[list[str], list[str]]] = (
@@ -255,18 +255,19 @@ def recognise(layer: Layer) -> tuple[str, int] | None:
     return None
 
 
-def _words(name: str) -> list[str]:
+def words_of(name: str) -> list[str]:
+    """The words and numbers of a name, in lower case: ``shotDiffuse2`` has three."""
     return [word.lower() for word in _WORD.findall(name)]
 
 
 def usual(layer: Layer) -> int:
     """Place of a layer among those of one rank; smaller for names that stand further ahead in :data:`NAMES`."""
-    return _USUAL.get("".join(_words(layer.title)), len(_USUAL))
+    return _USUAL.get("".join(words_of(layer.title)), len(_USUAL))
 
 
 def is_about_a_buffer(layer: Layer) -> bool:
     """Whether a layer's name denotes a property of a buffer other than the color, such as ``albedoVariance``."""
-    words = _words(layer.title)
+    words = words_of(layer.title)
     return bool(_ABOUT & set(words[-1:])) and any("".join(words[i:-1]) in _RANKS for i in range(len(words) - 1))
 
 
@@ -278,8 +279,6 @@ def fits(buffer: str, layer: Layer) -> bool:
         return count <= 2 or layer.is_color
     if buffer == "motion":
         return count in (2, 3, 4)
-    if buffer == "variance":
-        return count in (1, 3, 4)
     return count in (3, 4) or (count == 1 and buffer in GREY)
 
 

@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from mcdenoise.data.camera_matrices import Array
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.images import Image
 from mcdenoise.data.readers.layers import Layer, named, recognise
 from mcdenoise.errors import InputError

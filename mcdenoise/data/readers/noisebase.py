@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from mcdenoise.data.camera_matrices import Array
 from mcdenoise.data.exr import write_exr
 from mcdenoise.data.files import listed
 from mcdenoise.data.images import LARGEST_PIXEL_COUNT, Image, Mask
@@ -31,7 +30,7 @@ from mcdenoise.data.readers.sequence import Sequence as FrameSequence
 from mcdenoise.data.readers.values import Row
 from mcdenoise.errors import InputError, import_optional
 from mcdenoise.frame import Frame
-from mcdenoise.motion import miss
+from mcdenoise.motion import Array, miss
 from mcdenoise.reading import expecting
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from mcdenoise.data.camera_matrices import Array
+from mcdenoise.data.camera_path import Array
 from mcdenoise.data.exr import LARGEST_HALF
 from mcdenoise.data.images import Image, Mask
 
