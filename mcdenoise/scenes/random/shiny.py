@@ -29,8 +29,9 @@ def shine(builder: SceneBuilder, rng: Rng) -> None:
     builder.change_materials(lambda name, bsdf: _coated(rng, bsdf, areas.get(name, 0.0) > _LARGE))
     adders = [_wall_mirror, _wall_mirror, _vitrine, _standing_pane, _jewels, _lacquered_box, _glass_picture]
     for _ in range(int(rng.integers(1, 5))):
+        known = len(builder.points)
         adders[int(rng.integers(len(adders)))](builder, rng)
-        builder.points += [builder.points[-1]] * (_WEIGHT - 1)
+        builder.points += builder.points[known:] * (_WEIGHT - 1)
 
 
 def _coated(rng: Rng, bsdf: Bsdf, large: bool) -> Bsdf:
